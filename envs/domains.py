@@ -1,0 +1,118 @@
+"""Source and target domains: how the robot differs from its model.
+
+A `Domain` changes parameters (a payload, a longer pole) and adds disturbances (drag, wind, a push). The empty domain is
+the source. On the command line a domain is written `drag=0.3`, `mass=x1.2`, `push=0.5,0,0.2`; several combine.
+"""
+
+from dataclasses import dataclass, fields, replace
+from functools import partial
+
+from envs.errors import InputError
+
+WIND_DRAG = 0.3  # [1/s] rotor drag through which a disturbance `wind` is felt
+
+
+def drag(system, x, u, strength):
+    """Linear drag: v' <- v' - strength v, strength in 1/s (Faessler et al. 2017)."""
+    return system.accelerate(x, tuple(-strength[0] * v for v in system.velocity(x)))
+
+
+def quadratic_drag(system, x, u, strength):
+    """Drag that grows with the square of the speed: v' <- v' - strength |v| v, strength in 1/m."""
+    velocity = system.velocity(x)
+    speed = (sum(v * v for v in velocity) + 1e-12).sqrt()  # the small number keeps the gradient finite at rest
+    return system.accelerate(x, tuple(-strength[0] * speed * v for v in velocity))
+
+
+def push(system, x, u, strength):
+    """A constant force per mass in world axes [m/s^2]; a single number pushes along x."""
+    return system.accelerate(x, strength)
+
+
+def wind(system, x, u, strength):
+    """Steady wind [m/s] on a robot with rotor drag of 0.3 1/s: what it adds to the drag in still air."""
+    return system.accelerate(x, tuple(WIND_DRAG * w for w in strength))
+
+
+DISTURBANCES = {"drag": drag, "quadratic_drag": quadratic_drag, "push": push, "wind": wind}
+SCALAR = ("drag", "quadratic_drag")  # disturbances whose strength has no direction and can't be negative
+
+
+@dataclass(frozen=True)
+class Domain:
+    """Parameter changes, as (field, value) pairs, and disturbances, as (name, strength) with a strength in x, y, z."""
+
+    changes: tuple[tuple[str, float], ...] = ()
+    disturbances: tuple[tuple[str, tuple[float, float, float]], ...] = ()
+
+    def apply(self, system):
+        """The changed system; its low-level controller keeps the beliefs of the source."""
+        return replace(system.configured(), **dict(self.changes)) if self.changes else system
+
+    def forces(self):
+        """The disturbances as functions (system, x, u) -> {state name: extra rate}."""
+        return tuple(partial(DISTURBANCES[name], strength=strength) for name, strength in self.disturbances)
+
+
+def parse_target(text, system):
+    """Read `drag=0.3` or several, separated by spaces or given as a sequence, for a system.
+
+    Raises:
+        InputError: on an unknown name, a value that isn't a number, or one that makes no physical sense.
+    """
+    items = text.split() if isinstance(text, str) else [item for part in text for item in part.split()]
+    changes, disturbances = {}, []
+    for item in items:
+        name, sign, value = item.partition("=")
+        if not sign or not name or not value:
+            raise InputError(f"--target {item}: expected NAME=VALUE, such as drag=0.3 or mass=x1.2")
+        if name in _parameters(system):
+            changes.update(_changes(item, name, value, system, changes))
+        elif name in DISTURBANCES:
+            disturbances.append((name, _strength(item, name, value)))
+        else:
+            known = ", ".join([*DISTURBANCES, *_parameters(system)])
+            raise InputError(f"--target {item}: {system.name} has no {name!r}; expected one of {known}")
+    domain = Domain(tuple(changes.items()), tuple(disturbances))
+    try:
+        domain.apply(system)  # all changes at once: one alone may make no sense yet
+    except InputError as error:
+        raise InputError(f"--target {' '.join(items)}: {error}") from None
+    return domain
+
+
+def _parameters(system):
+    """Names that a target may change: numeric fields and groups of them; the control period belongs to the task."""
+    own = [f.name for f in fields(system) if isinstance(getattr(system, f.name), float) and f.name != "dt"]
+    return [*own, *system.groups]
+
+
+def _changes(item, name, value, system, earlier):
+    """The new value of each field that `name` stands for; `x1.2` multiplies, and later items see earlier ones."""
+    members = system.groups.get(name, (name,))
+    if value.startswith("x"):
+        factor = _number(item, value[1:])
+        return {field: factor * earlier.get(field, getattr(system, field)) for field in members}
+    if len(members) > 1:
+        raise InputError(f"--target {item}: {name} stands for {', '.join(members)}; give a factor such as {name}=x1.2")
+    return {members[0]: _number(item, value)}
+
+
+def _strength(item, name, value):
+    numbers = tuple(_number(item, part) for part in value.split(","))
+    if name in SCALAR:
+        if len(numbers) != 1 or numbers[0] < 0:
+            raise InputError(f"--target {item}: expected one number of at least 0, such as {name}=0.3")
+    elif len(numbers) not in (1, 3):
+        raise InputError(f"--target {item}: expected one number (along x) or three (x,y,z)")
+    return (*numbers, 0.0, 0.0)[:3]
+
+
+def _number(item, text):
+    try:
+        value = float(text)
+    except ValueError:
+        raise InputError(f"--target {item}: {text!r} is not a number") from None
+    if value != value or abs(value) == float("inf"):
+        raise InputError(f"--target {item}: {text!r} is not a finite number")
+    return value

@@ -1,0 +1,115 @@
+"""TrackingEnv: the TorchRL view of any dynamics and any task."""
+
+import torch
+from tensordict import TensorDict
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+
+class TrackingEnv(EnvBase):
+    """Stateless, batched environment; everything that changes travels in the TensorDict.
+
+    | key           | shape     | meaning                                                  |
+    |---------------|-----------|----------------------------------------------------------|
+    | `state`       | (*B, n)   | physical state                                           |
+    | `episode`     | (*B, 1)   | which of `episodes` is flown                             |
+    | `step`        | (*B, 1)   | control periods since the start                          |
+    | `observation` | (*B, o)   | what a policy sees of the state                          |
+    | `window`      | (*B, H, w)| what a policy sees of the reference                      |
+    | `action`      | (*B, m)   | in [-1, 1]                                               |
+    | `reward`      | (*B, 1)   | minus the task's cost of the step                        |
+    | `terminated`  | (*B, 1)   | diverged, or arrived                                     |
+    | `diverged`    | (*B, 1)   | failed                                                   |
+
+    `truncated` is set at the last step of the task. Dynamics, domain and episodes belong to the environment, so a
+    partial reset can't lose them. Gradients flow through `rollout`.
+
+    Args:
+        dynamics: anything that maps (..., n), (..., m) to (..., n) and has `.system`.
+        episodes: (N, ...) rows as `task.episodes` draws them.
+    """
+
+    batch_locked = False
+
+    def __init__(self, dynamics, task, episodes, batch_size=(), device="cpu", seed=0):
+        super().__init__(device=torch.device(device), batch_size=torch.Size(batch_size))
+        self.dynamics, self.task = dynamics, task
+        self.episodes = episodes.to(self.device)
+        self._supports_set_state = True
+        self._make_specs()
+        self.set_seed(seed)
+
+    def _make_specs(self):
+        self._build_specs(self.batch_size)
+
+    def _build_specs(self, batch):
+        start = torch.zeros(1, dtype=torch.long, device=self.device)
+        state = self.task.start(self.episodes[:1], start)
+        window = self.task.window(state, self.task.reference(self.episodes[:1], start, state))
+        observation = self.task.observe(state)
+        table = {"device": self.device}
+        count = {"dtype": torch.int64, **table}
+
+        def real(example):
+            return Unbounded(shape=(*batch, *example.shape[1:]), dtype=example.dtype, **table)
+
+        flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool, **table)
+        self.observation_spec = Composite(
+            state=real(state),
+            episode=Bounded(0, len(self.episodes) - 1, shape=(*batch, 1), **count),
+            step=Bounded(0, self.task.steps, shape=(*batch, 1), **count),
+            observation=real(observation),
+            window=real(window),
+            diverged=flag,
+            shape=batch,
+            **table,
+        )
+        actions = len(self.dynamics.system.Action._fields)
+        self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, actions), dtype=state.dtype, **table)
+        self.reward_spec = Unbounded(shape=(*batch, 1), dtype=state.dtype, **table)
+        self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=batch, **table)
+
+    def _reset(self, tensordict=None, **kwargs):
+        """Starts given episodes if the TensorDict names them and no state, else draws some at random."""
+        batch = self.batch_size if tensordict is None else tensordict.batch_size
+        drawn = torch.randint(len(self.episodes), (*batch, 1), generator=self.generator).to(self.device)
+        given = tensordict is not None and tensordict.get("_reset", None) is None and "episode" in tensordict.keys()
+        episode = tensordict["episode"] if given else drawn
+        step = torch.zeros_like(episode)
+        flat = episode.reshape(-1)
+        state = self.task.start(self.episodes[flat], step.reshape(-1))
+        return self._described(state.reshape(*batch, -1), episode, step)
+
+    def _step(self, tensordict):
+        batch = tensordict.batch_size
+        action, episode, step = tensordict["action"], tensordict["episode"], tensordict["step"]
+        rows, before = self.episodes[episode.reshape(-1)], tensordict["state"]
+        state = self.dynamics(before, action)
+        flat = state.reshape(-1, state.shape[-1])
+        goal = self.task.reference(rows, step.reshape(-1), before.reshape(flat.shape))[:, 0]
+        cost = self.task.cost(flat, action.reshape(-1, action.shape[-1]), goal)
+        following = self._described(state, episode, step + 1)
+        arrived = self.task.arrived(rows, step.reshape(-1) + 1, flat).reshape(*batch, 1)
+        following["terminated"] = following["diverged"] | arrived
+        following["truncated"] = following["step"] >= self.task.steps
+        following["done"] = following["terminated"] | following["truncated"]
+        following["reward"] = -cost.reshape(*batch, 1)
+        return following
+
+    def _described(self, state, episode, step):
+        """A TensorDict of the state and all that follows from it."""
+        batch = state.shape[:-1]
+        rows, flat_step, flat = self.episodes[episode.reshape(-1)], step.reshape(-1), state.reshape(-1, state.shape[-1])
+        window = self.task.window(flat, self.task.reference(rows, flat_step, flat))
+        described = {
+            "state": state,
+            "episode": episode,
+            "step": step,
+            "observation": self.task.observe(flat).reshape(*batch, -1),
+            "window": window.reshape(*batch, *window.shape[1:]),
+            "diverged": self.task.diverged(rows, flat_step, flat).reshape(*batch, 1),
+        }
+        return TensorDict(described, batch_size=batch, device=self.device)
+
+    def _set_seed(self, seed):
+        self.generator = torch.Generator().manual_seed(0 if seed is None else seed)

@@ -1,0 +1,258 @@
+"""Fixed wing: a small aircraft with linear aerodynamics, and the task of flying through a point.
+
+Beard and McLain (2012), "Small Unmanned Aircraft", eqs. 3.14-3.17 and 4.5-4.20. The lift, drag and moment are linear in
+angle of attack and sideslip, which are smoothly limited. Pitch moments scale with the chord, roll and yaw with the span.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+
+from envs import rigid_body
+from envs.quadrotor import attitude
+from envs.references import split_generator
+from envs.system import System, Task
+
+
+class State(NamedTuple):
+    px: Any
+    py: Any
+    pz: Any
+    qw: Any
+    qx: Any
+    qy: Any
+    qz: Any
+    u_b: Any
+    v_b: Any
+    w_b: Any
+    p: Any
+    q: Any
+    r: Any
+
+
+class Action(NamedTuple):
+    thrust: Any
+    elevator: Any
+    aileron: Any
+    rudder: Any
+
+
+def limited(angle, limit):
+    """An angle that is left alone well inside the limit and never exceeds it: |error| < 0.31 % up to a third of it."""
+    square = (angle / limit) * (angle / limit)
+    return angle / (1 + square * square).sqrt().sqrt()
+
+
+@dataclass(frozen=True)
+class FixedWing(System):
+    """Fixed-wing aircraft.
+
+    | state           | meaning                | frame                    | unit  |
+    |-----------------|------------------------|--------------------------|-------|
+    | `px, py, pz`    | position               | world: north, east, down | m     |
+    | `qw ... qz`     | attitude, scalar first | body to world            | -     |
+    | `u_b, v_b, w_b` | velocity over ground   | body: forward, right, down | m/s |
+    | `p, q, r`       | angular velocity       | body                     | rad/s |
+
+    | action     | -1 ... 1 is                              |
+    |------------|------------------------------------------|
+    | `thrust`   | 0 ... `thrust_max`                       |
+    | `elevator` | `-elevator_limit` ... `elevator_limit`   |
+    | `aileron`  | `-aileron_limit` ... `aileron_limit`     |
+    | `rudder`   | `-rudder_limit` ... `rudder_limit`       |
+    """
+
+    name: ClassVar[str] = "fixed_wing"
+    State: ClassVar[type] = State
+    Action: ClassVar[type] = Action
+    accelerations: ClassVar[tuple[str, ...]] = ("u_b", "v_b", "w_b", "p", "q", "r")
+    bounds: ClassVar[dict[str, tuple[float, float]]] = {
+        **dict.fromkeys(("dt", "mass", "inertia_x", "inertia_y", "inertia_z", "thrust_max"), (0.0, math.inf)),
+        **dict.fromkeys(("elevator_limit", "aileron_limit", "rudder_limit", "incidence_limit"), (0.0, math.pi / 2)),
+        **dict.fromkeys(("wing_area", "chord", "span"), (0.0, math.inf)),
+        **dict.fromkeys(("gravity", "air_density"), (-1e-9, math.inf)),
+        "thrust_loss": (-1.0, 1.0),
+    }
+    groups: ClassVar[dict[str, tuple[str, ...]]] = {
+        "inertia": ("inertia_x", "inertia_y", "inertia_z", "inertia_xz"),
+    }
+
+    dt: float = 0.05  # [s] control period
+    mass: float = 1.01  # [kg] this and what follows: reference implementation of Wiedemann, Wuest et al. (2023)
+    inertia_x: float = 0.04766  # [kg m^2]
+    inertia_y: float = 0.05005  # [kg m^2]
+    inertia_z: float = 0.09558  # [kg m^2]
+    inertia_xz: float = -0.00105  # [kg m^2]
+    gravity: float = 9.81  # [m/s^2]
+    air_density: float = 1.225  # [kg/m^3]
+    wing_area: float = 0.276  # [m^2]
+    chord: float = 0.185  # [m]
+    span: float = 1.54  # [m]
+    thrust_angle: float = 0.16535  # [rad] thrust line below the body x axis
+    thrust_max: float = 7.0  # [N]
+    elevator_limit: float = math.radians(20)  # [rad]
+    aileron_limit: float = math.radians(2.5)  # [rad]
+    rudder_limit: float = math.radians(20)  # [rad]
+    incidence_limit: float = math.radians(10)  # [rad] of angle of attack and sideslip
+    thrust_loss: float = 0.0  # [-] share of the commanded thrust that is not delivered
+    wind: float = 0.0  # [m/s] steady wind towards world x (north): a tail wind at the start of the task
+    crosswind: float = 0.0  # [m/s] steady wind towards world y (east)
+    downdraught: float = 0.0  # [m/s] steady wind towards world z (down)
+    lift: tuple[float, ...] = (0.39, 4.5321, 0.318, 0.527)  # [-] of 1, alpha, q, elevator
+    drag: tuple[float, ...] = (0.0765, 0.3346, 0.354, 0.004)
+    pitch: tuple[float, ...] = (0.02, -1.4037, -0.1324, -0.4236)
+    side: tuple[float, ...] = (-0.033, -0.1, 0.039, 0.0, 0.225)  # [-] of beta, p, r, aileron, rudder
+    roll: tuple[float, ...] = (-0.081, -0.529, 0.159, -0.453, 0.005)
+    yaw: tuple[float, ...] = (0.189, -0.083, -0.948, -0.041, -0.077)
+
+    def derivative(self, x, u):
+        velocity, rates = (x.u_b, x.v_b, x.w_b), (x.p, x.q, x.r)
+        columns = rigid_body.rotation_columns(attitude(x))
+        gravity = tuple(self.gravity * column[2] for column in columns)
+        force, torque = self.wrench(x, u)
+        turning = rigid_body.cross(rates, velocity)
+        linear = tuple(force[i] / self.mass + gravity[i] - turning[i] for i in range(3))
+        return State(
+            *rigid_body.to_world(attitude(x), velocity),
+            *rigid_body.quaternion_rates(attitude(x), rates),
+            *linear,
+            *self._angular_acceleration(rates, torque),
+        )
+
+    def wrench(self, x, u):
+        """Force [N] and torque [N m] of air and propeller in body axes, gravity excluded."""
+        wind = rigid_body.to_body(attitude(x), (self.wind, self.crosswind, self.downdraught))
+        ua, va, wa = x.u_b - wind[0], x.v_b - wind[1], x.w_b - wind[2]
+        plane = (ua * ua + wa * wa).sqrt()  # airspeed in the plane of symmetry
+        speed = (ua * ua + va * va + wa * wa).sqrt()
+        alpha = limited((wa / ua).arctan(), self.incidence_limit)
+        beta = limited((va / plane).arctan(), self.incidence_limit)
+        half_chord, half_span = self.chord / 2 / speed, self.span / 2 / speed
+        elevator, aileron, rudder = (
+            self.elevator_limit * u.elevator,
+            self.aileron_limit * u.aileron,
+            self.rudder_limit * u.rudder,
+        )
+        symmetric = (1, alpha, half_chord * x.q, elevator)
+        lateral = (beta, half_span * x.p, half_span * x.r, aileron, rudder)
+        pressure = 0.5 * self.air_density * self.wing_area * speed * speed
+        lift, drag, pitch = (pressure * _weighted(c, symmetric) for c in (self.lift, self.drag, self.pitch))
+        side, roll, yaw = (pressure * _weighted(c, lateral) for c in (self.side, self.roll, self.yaw))
+        thrust = (1 - self.thrust_loss) * self.thrust_max / 2 * (1 + u.thrust)
+        cos, sin = ua / plane, wa / plane
+        force = (
+            math.cos(self.thrust_angle) * thrust - drag * cos + lift * sin,
+            side,
+            math.sin(self.thrust_angle) * thrust - drag * sin - lift * cos,
+        )
+        return force, (self.span * roll, self.chord * pitch, self.span * yaw)
+
+    def _angular_acceleration(self, rates, torque):
+        """Euler's equation with the product of inertia I_xz [rad/s^2]."""
+        p, q, r = rates
+        ix, iy, iz, ixz = self.inertia_x, self.inertia_y, self.inertia_z, self.inertia_xz
+        gyroscopic = rigid_body.cross(rates, (ix * p - ixz * r, iy * q, iz * r - ixz * p))
+        roll, pitch, yaw = (torque[i] - gyroscopic[i] for i in range(3))
+        determinant = ix * iz - ixz * ixz
+        return (iz * roll + ixz * yaw) / determinant, pitch / iy, (ixz * roll + ix * yaw) / determinant
+
+    def velocity(self, x):
+        return rigid_body.to_world(attitude(x), (x.u_b, x.v_b, x.w_b))
+
+    def accelerate(self, x, acceleration):
+        return dict(zip(("u_b", "v_b", "w_b"), rigid_body.to_body(attitude(x), acceleration), strict=True))
+
+    def residual_inputs(self, x, u):
+        """Body velocity relative to a cruise of 11.5 m/s, direction of gravity in body axes, body rates, action."""
+        down = (column[2] for column in rigid_body.rotation_columns(attitude(x)))
+        return (x.u_b - CRUISE, x.v_b, x.w_b, *down, x.p, x.q, x.r, *u)
+
+    def project(self, x):
+        unit = rigid_body.normalised(attitude(x))
+        return x._replace(**dict(zip(("qw", "qx", "qy", "qz"), unit, strict=True)))
+
+
+CRUISE = 11.5  # [m/s] speed at which the task starts
+
+
+def _weighted(coefficients, values):
+    return sum(c * value for c, value in zip(coefficients, values, strict=True))
+
+
+@dataclass(frozen=True)
+class Waypoint(Task):
+    """Fly through a point 50 m ahead.
+
+    An episode is its target point (3,). The reference is the straight line from the aircraft to the target, flown at
+    constant speed and beyond the target. Metric: distance to the target where the path crosses the target's plane.
+    """
+
+    metric: ClassVar[str] = "distance to target"
+    unit: ClassVar[str] = "m"
+    reference_names: ClassVar[tuple[str, ...]] = ("px", "py", "pz")
+    state_weights: ClassVar[dict[str, float]] = dict.fromkeys(("px", "py", "pz"), 10.0)
+    action_weights: ClassVar[dict[str, float]] = dict.fromkeys(("elevator", "aileron", "rudder"), 0.1 / 4)
+    sets: ClassVar[tuple[str, ...]] = ("waypoint",)
+    encoder: ClassVar[str] = "linear"
+    thresholds: ClassVar[tuple[float, float]] = (4.0, 20.0)
+    limit: ClassVar[float] = 20.0  # [m] farther off the straight line is a failure
+    nearest: ClassVar[float] = 1.0  # [m] the line is aimed as if the target were at least that far ahead
+
+    system: FixedWing = FixedWing()
+    set: str = "waypoint"
+    steps: int = 120
+
+    def episodes(self, n, split, seed, speed=1.0):
+        sideways = 10 * torch.rand(n, 2, generator=split_generator(split, seed)) - 5
+        return torch.cat((torch.full((n, 1), 50.0), sideways), -1)
+
+    def start(self, episodes, step):
+        state = episodes.new_zeros(len(episodes), 13)
+        state[:, :3] = episodes * (step * self.system.dt * CRUISE / episodes.norm(dim=-1)).unsqueeze(-1)
+        state[:, 3] = 1.0
+        state[:, 7] = CRUISE
+        return state
+
+    def reference(self, episodes, step, state):
+        ahead = episodes - state[..., :3]
+        forward = ahead[..., :1].clamp(min=self.nearest)
+        direction = torch.nn.functional.normalize(torch.cat((forward, ahead[..., 1:]), -1), dim=-1)
+        travelled = CRUISE * self.system.dt * torch.arange(1, self.horizon + 1, device=state.device, dtype=state.dtype)
+        return state[..., None, :3] + travelled.unsqueeze(-1) * direction.unsqueeze(-2)
+
+    def observe(self, state):
+        """Attitude columns, body velocity and body rates (B, 12); not the position."""
+        x = State(*state.unbind(-1))
+        first, second, _ = rigid_body.rotation_columns(attitude(x))
+        return torch.stack((*first, *second, x.u_b, x.v_b, x.w_b, x.p, x.q, x.r), -1)
+
+    def window(self, state, reference):
+        """The last point of the reference relative to the aircraft (B, 1, 3)."""
+        return reference[..., -1:, :] - state[..., None, :3]
+
+    def distance(self, episodes, step, state):
+        """Distance to the straight line from the origin through the target."""
+        line = torch.nn.functional.normalize(episodes, dim=-1)
+        position = state[..., :3]
+        return (position - (position * line).sum(-1, keepdim=True) * line).norm(dim=-1)
+
+    def diverged(self, episodes, step, state):
+        return ~(self.distance(episodes, step, state) <= self.limit)
+
+    def arrived(self, episodes, step, state):
+        return state[..., 0] >= episodes[..., 0]
+
+    def score(self, episodes, states):
+        """Interpolates between the last state before the plane and the first behind it."""
+        beyond = states[..., 0] >= episodes[:, None, 0]
+        crossed = beyond.any(-1)
+        after = beyond.to(torch.int8).argmax(-1).clamp(min=1)
+        rows = torch.arange(len(states), device=states.device)
+        a, b = states[rows, after - 1, :3], states[rows, after, :3]
+        share = ((episodes[:, :1] - a[:, :1]) / (b[:, :1] - a[:, :1])).clamp(0, 1)
+        miss = (a + share * (b - a) - episodes).norm(dim=-1)
+        lost = self.distance(episodes[:, None], None, states) > self.limit
+        before = torch.arange(states.shape[1], device=states.device) <= after.unsqueeze(-1)
+        return miss, crossed & ~(lost & before).any(-1)

@@ -1,0 +1,157 @@
+"""What a robot (`System`) and a job for it (`Task`) must define.
+
+The equations of a system are written once, over named scalars. torch tensors and CasADi symbols share `+ - * / **` and
+the methods `.sin() .cos() .tan() .sqrt() .tanh() .exp() .arctan()`, so the same body runs in training, in model
+predictive control and in the residual. `atan2`, `clamp` and `where` are not shared: use smooth saturations.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import ClassVar
+
+import torch
+
+from envs.errors import InputError
+
+
+@dataclass(frozen=True)
+class System(ABC):
+    """A robot: physical parameters as fields, equations of motion as methods.
+
+    Derived quantities are properties, never stored. Policies act in [-1, 1]; `derivative` scales to physical units.
+    """
+
+    name: ClassVar[str]
+    State: ClassVar[type]  # NamedTuple of the state's scalars; its field order is the order of every state tensor
+    Action: ClassVar[type]  # NamedTuple of the action's scalars, each in [-1, 1]
+    accelerations: ClassVar[tuple[str, ...]]  # state rows that a force or torque acts on
+    bounds: ClassVar[dict[str, tuple[float, float]]] = {}  # open interval of each checked parameter
+    groups: ClassVar[dict[str, tuple[str, ...]]] = {}  # one name for several fields that are scaled together
+
+    dt: float  # [s] control period
+
+    def __post_init__(self):
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, float | int) and not math.isfinite(value):
+                raise InputError(f"{self.name}: {field.name} is {value}, expected a finite number")
+            low, high = self.bounds.get(field.name, (-math.inf, math.inf))
+            if isinstance(value, float | int) and not low < value < high:
+                raise InputError(f"{self.name}: {field.name} is {value:g}, expected between {low:g} and {high:g}")
+
+    @abstractmethod
+    def derivative(self, x, u):
+        """Rate of change of every state scalar [unit/s], as a `State`."""
+
+    @abstractmethod
+    def velocity(self, x):
+        """Velocity of the robot in world axes, a 3-tuple [m/s]."""
+
+    @abstractmethod
+    def accelerate(self, x, acceleration):
+        """What an external force per mass [m/s^2, world axes] adds to the derivative: {state name: rate}."""
+
+    @abstractmethod
+    def residual_inputs(self, x, u):
+        """What an unmodelled force may depend on: a tuple of scalars of order one, invariant to translation."""
+
+    def residual_rates(self, x, residual):
+        """What a residual, one scalar for each of `accelerations`, adds to the derivative: {state name: rate}."""
+        return dict(zip(self.accelerations, residual, strict=True))
+
+    def project(self, x):
+        """Put a state back on its manifold after a step (unit quaternions)."""
+        return x
+
+    def configured(self):
+        """The same robot with its controller's beliefs fixed, so that a changed airframe no longer changes them."""
+        return self
+
+    @property
+    def trim_action(self):
+        """The action that keeps the robot at rest or in steady flight, as an `Action` of floats."""
+        return self.Action(*(0.0 for _ in self.Action._fields))
+
+
+@dataclass(frozen=True)
+class Task(ABC):
+    """A job: how episodes start, the reference over the horizon, what a policy sees, the cost and the metric.
+
+    An episode is one row of a tensor (N, ...), whose meaning belongs to the task: a reference trajectory, a target
+    point, a starting state. `system` is the nominal robot; the dynamics that an episode is flown in may differ.
+    Shapes below: B episodes, n states, m actions, H the horizon, r reference entries.
+    """
+
+    metric: ClassVar[str]  # what tables report
+    unit: ClassVar[str]
+    reference_names: ClassVar[tuple[str, ...]]  # states that the reference prescribes; the others are wanted at zero
+    state_weights: ClassVar[dict[str, float]]
+    action_weights: ClassVar[dict[str, float]]  # on the squared distance from the trim action
+    sets: ClassVar[tuple[str, ...]]  # names of the families of episodes; the first is the default
+    encoder: ClassVar[str]  # how a policy reads the reference: "conv", "linear" or "none"
+    thresholds: ClassVar[tuple[float, float]]  # first and last divergence threshold of the curriculum
+    speeds: ClassVar[tuple[float, ...]] = (1.0,)  # speeds of the curriculum
+
+    system: System
+    set: str
+    steps: int  # [-] length of an episode in control periods
+    horizon: int = 10
+
+    def __post_init__(self):
+        if self.horizon < 1:
+            raise InputError(f"horizon is {self.horizon}, expected at least 1")
+
+    @abstractmethod
+    def episodes(self, n, split, seed, speed=1.0):
+        """Draw `n` episodes of a split ("train", "validation", "test"): (n, ...). `speed` < 1 makes them slower."""
+
+    @abstractmethod
+    def start(self, episodes, step):
+        """The state (B, n) on the reference of `episodes` (B, ...) at `step` (B,)."""
+
+    @abstractmethod
+    def reference(self, episodes, step, state):
+        """The next H reference points after `step` (B,), seen from `state` (B, n): (B, H, r)."""
+
+    @abstractmethod
+    def observe(self, state):
+        """What a policy sees of the state (B, n): (B, o)."""
+
+    @abstractmethod
+    def window(self, state, reference):
+        """What a policy sees of the reference (B, H, r): (B, H, w)."""
+
+    @abstractmethod
+    def distance(self, episodes, step, state):
+        """Distance (B,) of a state to its reference at `step`: what the curriculum's threshold limits."""
+
+    @abstractmethod
+    def diverged(self, episodes, step, state):
+        """Whether an episode has failed (B,)."""
+
+    def arrived(self, episodes, step, state):
+        """Whether an episode has ended well before its last step (B,)."""
+        return torch.zeros(state.shape[:-1], dtype=torch.bool, device=state.device)
+
+    @abstractmethod
+    def score(self, episodes, states):
+        """Metric (B,) and success (B,) of the flown states (B, steps + 1, n); what follows an end is to be ignored."""
+
+    def cost(self, state, action, reference):
+        """Weighted squared deviations (...) of state (..., n) from reference (..., r) and of action from trim."""
+        spread, state_weights, trim, action_weights = _cost_tables(self, state.dtype, state.device)
+        deviation = (state - reference @ spread).square() @ state_weights
+        return deviation + (action - trim).square() @ action_weights
+
+
+@lru_cache(maxsize=64)
+def _cost_tables(task, dtype, device):
+    """The weights of a task as tensors; `spread` (r, n) places reference entries at their states."""
+    names = task.system.State._fields
+    table = {"dtype": dtype, "device": device}
+    spread = torch.tensor([[float(a == b) for b in names] for a in task.reference_names], **table)
+    state_weights = torch.tensor([task.state_weights.get(name, 0.0) for name in names], **table)
+    action_weights = torch.tensor([task.action_weights.get(name, 0.0) for name in task.system.Action._fields], **table)
+    return spread, state_weights, torch.tensor(task.system.trim_action, **table), action_weights
