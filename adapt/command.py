@@ -1,0 +1,133 @@
+"""What all commands share: options, one-line errors, exit statuses, output folders, files written whole."""
+
+import contextlib
+import errno
+import io
+import json
+import os
+import re
+import sys
+import tempfile
+from pathlib import Path
+
+from envs.errors import InputError
+
+USAGE, INTERRUPTED = 2, 130  # exit statuses
+
+
+def run(name, options, main):
+    """Parse the command line into the dataclass `options` and call `main` with it; ends the process.
+
+    Bad input ends in one line and status 2, Ctrl-C in one line and status 130.
+    """
+    os.environ.setdefault("RL_LOGGING_LEVEL", "ERROR")
+    prefix = f"{name.split('.')[-1]}: "
+    try:
+        main(_parse(name, options))
+    except InputError as error:
+        sys.exit(_fail(prefix, str(error), USAGE))
+    except KeyboardInterrupt as interrupt:
+        sys.exit(_fail(prefix, f"interrupted; {interrupt}" if str(interrupt) else "interrupted", INTERRUPTED))
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EPERM):
+            raise
+        sys.exit(_fail(prefix, f"{error.filename or 'output'}: {error.strerror}; nothing half-written is kept", USAGE))
+
+
+def _fail(prefix, message, status):
+    print(prefix + " ".join(message.split()), file=sys.stderr)
+    return status
+
+
+def _parse(name, options):
+    """tyro's own parsing, with its framed message folded to one line."""
+    import tyro
+
+    message = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(message):
+            return tyro.cli(options, prog=f"python -m {name}", config=(tyro.conf.FlagCreatePairsOff,))
+    except SystemExit as leaving:
+        if leaving.code in (0, None):
+            raise
+    paragraphs = re.split(r"[│|]?\s*─{4,}[^\n]*", re.sub(r"[╭╰][^\n]*", "", message.getvalue()))
+    text = " ".join(re.sub(r"[│╭╮╯╰]", " ", paragraphs[0]).split()) or "bad options"
+    raise InputError(f"{text} (see python -m {name} --help)")
+
+
+def output_folder(path, overwrite):
+    """Make the folder of a run, or refuse one that already holds something.
+
+    Raises:
+        InputError: when it is in use and `overwrite` is off, or can't be written to.
+    """
+    folder = Path(path)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--out {folder}: is a file, expected a folder")
+    if folder.is_dir() and any(folder.iterdir()) and not overwrite:
+        raise InputError(f"--out {folder}: already holds results; name another folder or add --overwrite")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError as error:
+        raise InputError(f"--out {folder}: can't be written to ({error.strerror})") from None
+
+
+@contextlib.contextmanager
+def whole(path):
+    """A temporary name beside `path` that takes its place when the block ends well, and vanishes when it doesn't."""
+    path = Path(path)
+    partial = path.with_name(f".partial-{path.name}")
+    try:
+        yield partial
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_json(path, content):
+    """Write JSON that people can read."""
+    with whole(path) as partial:
+        partial.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def set_threads(threads):
+    """Threads for torch; small batches run fastest on one.
+
+    Raises:
+        InputError: when below 1.
+    """
+    import torch
+
+    if threads < 1:
+        raise InputError(f"--threads {threads}: expected at least 1")
+    torch.set_num_threads(threads)
+
+
+def pick_device(name):
+    """A torch device by name.
+
+    Raises:
+        InputError: when this machine has none of that name.
+    """
+    import torch
+
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(f"--device {name}: not available here ({str(error).splitlines()[0]})") from None
+    return device
+
+
+def environment(seed, threads):
+    """What a result depends on beside its options: seed, threads, versions, commit."""
+    import platform
+    import subprocess
+    from importlib.metadata import version
+
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+    packages = {name: version(name) for name in ("torch", "torchrl", "tensordict", "casadi")}
+    return {"seed": seed, "threads": threads, "python": platform.python_version(), **packages, "commit": commit}

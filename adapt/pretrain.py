@@ -1,0 +1,266 @@
+"""Train a policy in the nominal robot: `python -m adapt.pretrain --system quadrotor --seed 0`."""
+
+import csv
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from adapt import command
+from envs.errors import InputError
+
+LOG = ("update", "seconds", "cost", "gradient_norm", "threshold", "stage", "resets", "skipped", "error", "success")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train a policy by analytic policy gradient in the nominal robot.
+
+    Writes policy.safetensors (the best on validation), log.csv, config.json and training.pt (to resume from) into --out.
+    Settings that are not given take the values tuned for the system.
+    """
+
+    system: str = "quadrotor"
+    """Robot: cartpole, quadrotor or fixed_wing."""
+    vehicle: str | None = None
+    """Parameters of your own robot: a shipped name such as crazyflie, or a TOML file."""
+    target: tuple[str, ...] = ()
+    """Train in a changed robot, such as drag=0.3 mass=x1.2."""
+    set: str | None = None
+    """Family of training episodes (quadrotor: paper, fast)."""
+    seed: int = 0
+    """Seed of everything that is drawn."""
+    preset: str | None = None
+    """Settings to start from: a system's tuned ones (default) or "paper"."""
+    updates: int | None = None
+    """Gradient steps."""
+    batch: int | None = None
+    """Episodes flown side by side."""
+    width: int | None = None
+    """Neurons of every layer."""
+    learning_rate: float | None = None
+    """First learning rate."""
+    curriculum: float | None = None
+    """Share of the updates after which the curriculum ends; 0 switches it off."""
+    exploration: float | None = None
+    """Standard deviation of noise on the flown actions."""
+    every: int = 500
+    """Updates between validations."""
+    stop_at: float | None = None
+    """Stop as soon as the validation error is below this, all episodes succeeding."""
+    out: str | None = None
+    """Folder for the results (default: runs/pretrain-SYSTEM-seedN)."""
+    overwrite: bool = False
+    """Replace what the folder holds."""
+    resume: bool = False
+    """Continue the run in --out where it stopped."""
+    compile: bool = False
+    """Compile the dynamics (needs a C++ compiler; pays off in long runs)."""
+    device: str = "cpu"
+    """Where to train: cpu, cuda."""
+    threads: int = 1
+    """Threads of torch; small batches run fastest on one."""
+
+
+def main(options):
+    """Train, validate and save until the last update."""
+    import torch
+
+    from envs import make_dynamics, make_task
+    from policies import apg
+
+    command.set_threads(options.threads)
+    device = command.pick_device(options.device)
+    system = _system(options)
+    config = configuration(options, system)
+    task = make_task(system, options.set)
+    folder = _folder(options, system)
+    dynamics = make_dynamics(system, options.target)
+    banks = apg.training_banks(task, config, options.seed, device)
+    run = apg.begin(dynamics, task, banks, config, options.seed)
+    report = {
+        "options": asdict(options),
+        "config": asdict(config),
+        **command.environment(options.seed, options.threads),
+    }
+    if options.resume:
+        run.load_state_dict(_saved(folder, config), banks, config, task)
+    command.write_json(folder / "config.json", report)
+    torch.manual_seed(options.seed)
+    _train(run, dynamics, task, banks, config, options, folder)
+
+
+def configuration(options, system):
+    """The tuned settings of a system, or of `--preset`, with what the command line changes."""
+    from policies import apg
+
+    name = options.preset or system.name
+    if name not in apg.PRESETS and options.preset:
+        raise InputError(f"--preset {name}: expected one of {', '.join(apg.PRESETS)}")
+    names = ("updates", "batch", "width", "learning_rate", "curriculum", "exploration")
+    changes = {key: getattr(options, key) for key in names if getattr(options, key) is not None}
+    return replace(apg.PRESETS.get(name, apg.APGConfig()), **changes)
+
+
+def _system(options):
+    from envs import make_system
+
+    system = make_system(options.system)
+    if options.vehicle is None:
+        return system
+    from envs.vehicles import load_vehicle
+
+    vehicle = load_vehicle(options.vehicle)
+    if vehicle.system.name != system.name:
+        raise InputError(f"--vehicle {options.vehicle}: is a {vehicle.system.name}, --system says {system.name}")
+    return vehicle.system
+
+
+def _folder(options, system):
+    name = (options.vehicle and Path(options.vehicle).stem) or system.name
+    path = Path(options.out or f"runs/pretrain-{name}-seed{options.seed}")
+    if options.resume:
+        if not (path / "training.pt").is_file():
+            raise InputError(f"--resume: {path} holds no training.pt to continue from")
+        return path
+    return command.output_folder(path, options.overwrite)
+
+
+def _saved(folder, config):
+    import torch
+
+    saved = torch.load(folder / "training.pt", weights_only=True)
+    if saved["config"] != asdict(config):
+        changed = [key for key, value in asdict(config).items() if saved["config"].get(key) != value]
+        raise InputError(f"--resume: {folder} was trained with other settings of {', '.join(changed)}; give the same")
+    return saved
+
+
+def _train(run, dynamics, task, banks, config, options, folder):
+    from tqdm import tqdm
+
+    from policies import apg
+
+    log = Log(folder, keep=options.resume)
+    best = log.best()
+    begin = time.perf_counter() - log.seconds()
+    flown = compiled(dynamics) if options.compile else dynamics
+    bar = tqdm(total=config.updates, initial=run.update, desc=f"training {task.system.name}", unit="update")
+    try:
+        for metrics in apg.train(run, flown, task, banks, config):
+            bar.update()
+            if run.update % options.every and run.update != config.updates:
+                continue
+            result = validate(run.network, dynamics, task)
+            bar.set_postfix_str(f"validation {result['mean']:.4f} {task.unit}, success {result['success']:.2f}")
+            row = {
+                **metrics,
+                "seconds": time.perf_counter() - begin,
+                "error": result["mean"],
+                "success": result["success"],
+            }
+            log.write(row)
+            best = _keep_best(run, task, options, folder, row, best)
+            _save_training(run, config, folder)
+            if options.stop_at is not None and result["mean"] <= options.stop_at and result["success"] == 1:
+                break
+    except KeyboardInterrupt:
+        _save_training(run, config, folder)
+        raise KeyboardInterrupt(f"continue with --resume --out {folder}") from None
+    finally:
+        bar.close()
+        log.close()
+    if run.skipped:
+        print(f"{run.skipped} updates were skipped because their gradient was not finite")
+    seconds = time.perf_counter() - begin
+    print(
+        f"{folder}/policy.safetensors: validation error {best[1]:.4f} {task.unit}, success {-best[0]:.2f}, {seconds:.0f} s"
+    )
+
+
+def validate(network, dynamics, task, n=100):
+    """Summary of `n` validation episodes."""
+    from policies.evaluate import evaluate, test_episodes
+    from policies.networks import as_actor
+
+    device = next(network.parameters()).device
+    return evaluate(as_actor(network), dynamics, task, test_episodes(task, n, "validation").to(device)).summary
+
+
+def compiled(dynamics):
+    """The dynamics compiled by torch, or as they are where that fails."""
+    import torch
+
+    step = torch.compile(lambda state, action: dynamics(state, action))
+    try:
+        sizes = len(dynamics.system.State._fields), len(dynamics.system.Action._fields)
+        step(torch.ones(2, sizes[0]), torch.zeros(2, sizes[1]))
+    except Exception as error:  # any failure of the compiler ends here: eager is always right
+        print(f"--compile: not possible here ({type(error).__name__}), going on without")
+        return dynamics
+    return step
+
+
+def _keep_best(run, task, options, folder, row, best):
+    """Save the policy if it succeeds more often than the best so far, or as often and more accurately."""
+    from policies.checkpoints import save_policy
+
+    score = (-row["success"], row["error"] if row["error"] == row["error"] else float("inf"))
+    if score >= best:
+        return best
+    info = {"validation": score[1], "success": row["success"], "unit": task.unit, "update": row["update"]}
+    info |= {"seed": options.seed, "method": "apg", "seconds": round(row["seconds"], 1)}
+    save_policy(folder / "policy.safetensors", run.network, task, info)
+    return score
+
+
+def _save_training(run, config, folder):
+    import torch
+
+    with command.whole(folder / "training.pt") as partial:
+        torch.save({**run.state_dict(), "config": asdict(config)}, partial)
+
+
+class Log:
+    """log.csv, and TensorBoard where it is installed."""
+
+    def __init__(self, folder, keep):
+        path = folder / "log.csv"
+        self.rows = list(csv.DictReader(path.open())) if keep and path.is_file() else []
+        self.path, self.board = path, _tensorboard(folder)
+
+    def write(self, row):
+        """Add a row; the file on disk is always whole."""
+        self.rows.append({key: row[key] for key in LOG})
+        with command.whole(self.path) as partial, partial.open("w", newline="") as file:
+            writer = csv.DictWriter(file, LOG)
+            writer.writeheader()
+            writer.writerows(self.rows)
+        for key in LOG[2:]:
+            if self.board:
+                self.board.add_scalar(key, row[key], row["update"])
+
+    def best(self):
+        """Best (minus success, error) so far."""
+        scores = [(-float(row["success"]), float(row["error"])) for row in self.rows]
+        return min((s for s in scores if s[1] == s[1]), default=(0.0, float("inf")))
+
+    def seconds(self):
+        """Time spent before this run was resumed."""
+        return float(self.rows[-1]["seconds"]) if self.rows else 0.0
+
+    def close(self):
+        """Flush TensorBoard."""
+        if self.board:
+            self.board.close()
+
+
+def _tensorboard(folder):
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        return None
+    return SummaryWriter(str(folder / "tensorboard"))
+
+
+if __name__ == "__main__":
+    command.run("adapt.pretrain", Options, main)

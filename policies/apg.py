@@ -1,0 +1,231 @@
+"""Analytic policy gradient: train a policy by differentiating the task's cost through the dynamics.
+
+Wiedemann, Wuest, Loquercio, Mueller, Floreano and Scaramuzza (2023), "Training Efficient Controllers via Analytic Policy
+Gradient": receding horizon, all actions of the horizon planned at once, data collected by the partly trained policy,
+a curriculum over the allowed divergence and the speed of the reference. Where we differ: see `APGConfig`.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+
+from envs.errors import InputError
+from policies.networks import network_for
+
+
+@dataclass(frozen=True)
+class APGConfig:
+    """Settings of a training run.
+
+    The paper alternates between collecting a data set and epochs of SGD on it. Here many episodes are flown side by
+    side and each update advances all of them by one step, so that the data are always those of the present policy; the
+    optimiser is Adam with a falling learning rate.
+    """
+
+    updates: int = 3000
+    batch: int = 256  # episodes flown side by side
+    width: int = 64  # neurons of every layer of the network
+    learning_rate: float = 3e-3
+    final_rate: float = 0.01  # [-] last learning rate as a share of the first
+    warmup: float = 0.02  # [-] share of the updates in which the learning rate rises
+    optimizer: Literal["adam", "sgd"] = "adam"  # sgd has momentum 0.9
+    clip: float = 1.0  # [-] gradients of a larger norm are scaled down to it
+    curriculum: float = 0.5  # [-] share of the updates after which the last threshold and speed are reached
+    exploration: float = 0.1  # [-] standard deviation of noise on the flown actions
+    episodes: int = 4000  # training episodes drawn
+
+    def __post_init__(self):
+        for name in ("updates", "batch", "width", "learning_rate", "clip", "episodes"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"--config.{name.replace('_', '-')} {getattr(self, name)}: expected more than 0")
+
+
+PRESETS = {
+    "cartpole": APGConfig(updates=3000),
+    "quadrotor": APGConfig(updates=6000, width=128, learning_rate=1e-2),
+    "fixed_wing": APGConfig(updates=2000),
+    "paper": APGConfig(
+        updates=20000,
+        batch=8,
+        learning_rate=1e-5,
+        final_rate=1.0,
+        warmup=0.0,
+        optimizer="sgd",
+        clip=1e9,
+        exploration=0.0,
+    ),
+}
+
+
+class Flight:
+    """Episodes flown side by side by the partly trained policy."""
+
+    def __init__(self, task, dynamics, episodes, size, generator):
+        self.task, self.dynamics, self.generator = task, dynamics, generator
+        self.episodes = episodes
+        self.row = self._draw(len(episodes), size)
+        self.step = self._draw(task.steps, size)
+        self.state = task.start(episodes[self.row], self.step)
+
+    def _draw(self, limit, size):
+        return torch.randint(limit, (size,), generator=self.generator).to(self.episodes.device)
+
+    def switch(self, episodes):
+        """Continue on other episodes, such as faster ones."""
+        self.episodes = episodes
+        self.state = self.task.start(episodes[self.row], self.step)
+
+    def look(self):
+        """The present states and the references ahead of them."""
+        rows = self.episodes[self.row]
+        return self.state, self.task.reference(rows, self.step, self.state)
+
+    @torch.no_grad()
+    def advance(self, action, threshold, exploration):
+        """One control period; who strays farther than the threshold is put back on the reference."""
+        task = self.task
+        noise = exploration * torch.randn(action.shape, generator=self.generator).to(action)
+        self.state = self.dynamics(self.state, (action + noise).clamp(-1, 1))
+        self.step = self.step + 1
+        rows = self.episodes[self.row]
+        strayed = ~(task.distance(rows, self.step, self.state) <= threshold)
+        ended = (self.step >= task.steps) | task.arrived(rows, self.step, self.state)
+        ended |= task.diverged(rows, self.step, self.state)
+        fresh = self._draw(len(self.episodes), len(self.row))
+        self.row = torch.where(ended, fresh, self.row)
+        self.step = torch.where(ended, torch.zeros_like(self.step), self.step)
+        back = (strayed | ended).unsqueeze(-1)
+        self.state = torch.where(back, task.start(self.episodes[self.row], self.step), self.state)
+        return strayed.float().mean()
+
+
+def plan_cost(dynamics, task, state, plan, reference):
+    """Cost (B,) of a plan (B, T, m) from state (B, n) against reference (B, T, r), differentiable in all of them."""
+    states = []
+    for action in plan.unbind(-2):
+        state = dynamics(state, action)
+        states.append(state)
+    return task.cost(torch.stack(states, -2), plan, reference).sum(-1)
+
+
+def learning_rate(config, update):
+    """Linear warm-up, then a cosine fall to `final_rate`."""
+    share = update / config.updates
+    if share < config.warmup:
+        return config.learning_rate * (update + 1) / (config.warmup * config.updates + 1)
+    fall = 0.5 * (1 + math.cos(math.pi * (share - config.warmup) / (1 - config.warmup)))
+    return config.learning_rate * (config.final_rate + (1 - config.final_rate) * fall)
+
+
+def normalise(network, task, dynamics, episodes, generator, size=256, steps=40):
+    """Set the normalisation of a network from states that random actions lead to around the reference."""
+    flight = Flight(task, dynamics, episodes, size, generator)
+    seen = []
+    for _ in range(steps):
+        state, reference = flight.look()
+        seen.append((task.observe(state), task.window(state, reference)))
+        action = 2 * torch.rand(size, len(task.system.Action._fields), generator=generator).to(state) - 1
+        flight.advance(action, task.thresholds[1], 0.0)
+    network.normalise(*(torch.cat(parts) for parts in zip(*seen, strict=True)))
+
+
+@dataclass
+class Training:
+    """Everything that a training run changes, so that it can be saved and continued."""
+
+    network: torch.nn.Module
+    optimizer: torch.optim.Optimizer
+    flight: Flight
+    generator: torch.Generator
+    update: int = 0
+    skipped: int = 0  # updates left out because their gradient was not finite
+
+    def state_dict(self):
+        """Tensors and numbers only."""
+        flight = {name: getattr(self.flight, name) for name in ("row", "step", "state")}
+        return {
+            "network": self.network.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "flight": flight,
+            "generator": self.generator.get_state(),
+            "update": self.update,
+            "skipped": self.skipped,
+        }
+
+    def load_state_dict(self, saved, banks, config, task):
+        """Continue where `saved` left off, on the episodes that were flown then."""
+        self.network.load_state_dict(saved["network"])
+        self.optimizer.load_state_dict(saved["optimizer"])
+        self.generator.set_state(saved["generator"])
+        self.update, self.skipped = saved["update"], saved["skipped"]
+        self.flight.episodes = banks[stage(config, task, len(banks), max(0, self.update - 1))[1]]
+        for name, value in saved["flight"].items():
+            setattr(self.flight, name, value)
+
+
+def begin(dynamics, task, banks, config, seed, network=None):
+    """A training run at its first update; without a network, a new one is drawn from the seed and normalised."""
+    generator = torch.Generator().manual_seed(seed)
+    if network is None:
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            network = network_for(task, features=config.width, widths=(config.width,) * 3).to(banks[0].device)
+        normalise(network, task, dynamics, banks[-1], generator)
+    kinds = {"adam": lambda p: torch.optim.Adam(p), "sgd": lambda p: torch.optim.SGD(p, momentum=0.9)}
+    flight = Flight(task, dynamics, banks[0], config.batch, generator)
+    return Training(network, kinds[config.optimizer](network.parameters()), flight, generator)
+
+
+def training_banks(task, config, seed, device="cpu"):
+    """The training episodes at each speed of the curriculum, slowest first: the same paths, played slower."""
+    return [task.episodes(config.episodes, "train", seed, speed=speed).to(device) for speed in task.speeds]
+
+
+def train(run, dynamics, task, banks, config):
+    """Advance a training run to its last update; yields a dict of metrics after each.
+
+    Args:
+        run: `Training`, changed in place.
+        dynamics: what the gradient flows through and what data are collected in.
+        banks: training episodes of each speed of the curriculum, slowest first.
+    """
+    parameters = list(run.network.parameters())
+    while run.update < config.updates:
+        threshold, bank = stage(config, task, len(banks), run.update)
+        if run.flight.episodes is not banks[bank]:
+            run.flight.switch(banks[bank])
+        for group in run.optimizer.param_groups:
+            group["lr"] = learning_rate(config, run.update)
+        state, reference = run.flight.look()
+        plan = run.network(task.observe(state), task.window(state, reference))
+        cost = plan_cost(dynamics, task, state, plan, reference).mean()
+        run.optimizer.zero_grad(set_to_none=True)
+        cost.backward()
+        norm = torch.nn.utils.clip_grad_norm_(parameters, config.clip)
+        if torch.isfinite(norm):
+            run.optimizer.step()
+        else:
+            run.skipped += 1
+        resets = run.flight.advance(plan[:, 0].detach(), threshold, config.exploration)
+        run.update += 1
+        yield {
+            "update": run.update,
+            "cost": float(cost.detach()),
+            "gradient_norm": float(norm),
+            "threshold": threshold,
+            "stage": bank,
+            "resets": float(resets),
+            "skipped": run.skipped,
+        }
+
+
+def stage(config, task, banks, update):
+    """Divergence threshold and speed stage: the threshold rises linearly in each stage and starts again in the next."""
+    first, last = task.thresholds
+    share = update / max(1, config.curriculum * config.updates)
+    if share >= 1:
+        return last, banks - 1
+    bank = int(share * banks)
+    return first + (last - first) * (share * banks - bank), bank
