@@ -15,7 +15,7 @@ LOG = ("update", "seconds", "cost", "gradient_norm", "threshold", "stage", "rese
 class Options:
     """Train a policy by analytic policy gradient in the nominal robot.
 
-    Writes policy.safetensors (the best on validation), log.csv, config.json and training.pt (to resume from) into --out.
+    Writes policy.safetensors (the best on validation), log.csv, config.json and training.pt (to resume from).
     Settings that are not given take the values tuned for the system.
     """
 
@@ -171,10 +171,8 @@ def _train(run, dynamics, task, banks, config, options, folder):
         log.close()
     if run.skipped:
         print(f"{run.skipped} updates were skipped because their gradient was not finite")
-    seconds = time.perf_counter() - begin
-    print(
-        f"{folder}/policy.safetensors: validation error {best[1]:.4f} {task.unit}, success {-best[0]:.2f}, {seconds:.0f} s"
-    )
+    result = f"validation error {best[1]:.4f} {task.unit}, success {-best[0]:.2f}"
+    print(f"{folder}/policy.safetensors: {result}, {time.perf_counter() - begin:.0f} s")
 
 
 def validate(network, dynamics, task, n=100):

@@ -69,15 +69,21 @@ class TrackingEnv(EnvBase):
         self.reward_spec = Unbounded(shape=(*batch, 1), dtype=state.dtype, **table)
         self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=batch, **table)
 
-    def _reset(self, tensordict=None, **kwargs):
-        """Starts given episodes if the TensorDict names them and no state, else draws some at random."""
+    def _reset(self, tensordict=None, *, set_state=False, **kwargs):
+        """Starts the episodes that the TensorDict names if it has no state, else some at random.
+
+        With `set_state` it goes on from the state, episode and step of the TensorDict.
+        """
         batch = self.batch_size if tensordict is None else tensordict.batch_size
-        drawn = torch.randint(len(self.episodes), (*batch, 1), generator=self.generator).to(self.device)
-        given = tensordict is not None and tensordict.get("_reset", None) is None and "episode" in tensordict.keys()
-        episode = tensordict["episode"] if given else drawn
+        given = set() if tensordict is None else set(tensordict.keys())
+        if set_state and "state" in given:
+            return self._described(tensordict["state"], tensordict["episode"], tensordict["step"])
+        if "episode" in given and not given & {"_reset", "state"}:
+            episode = tensordict["episode"]
+        else:
+            episode = torch.randint(len(self.episodes), (*batch, 1), generator=self.generator).to(self.device)
         step = torch.zeros_like(episode)
-        flat = episode.reshape(-1)
-        state = self.task.start(self.episodes[flat], step.reshape(-1))
+        state = self.task.start(self.episodes[episode.reshape(-1)], step.reshape(-1))
         return self._described(state.reshape(*batch, -1), episode, step)
 
     def _step(self, tensordict):

@@ -1,7 +1,7 @@
 """Fixed wing: a small aircraft with linear aerodynamics, and the task of flying through a point.
 
-Beard and McLain (2012), "Small Unmanned Aircraft", eqs. 3.14-3.17 and 4.5-4.20. The lift, drag and moment are linear in
-angle of attack and sideslip, which are smoothly limited. Pitch moments scale with the chord, roll and yaw with the span.
+Beard and McLain (2012), "Small Unmanned Aircraft", eqs. 3.14-3.17 and 4.5-4.20. Lift, drag and moments are linear in
+angle of attack and sideslip, which are smoothly limited. Pitch moments scale with the chord, the others with the span.
 """
 
 import math

@@ -1,8 +1,8 @@
 """Analytic policy gradient: train a policy by differentiating the task's cost through the dynamics.
 
-Wiedemann, Wuest, Loquercio, Mueller, Floreano and Scaramuzza (2023), "Training Efficient Controllers via Analytic Policy
-Gradient": receding horizon, all actions of the horizon planned at once, data collected by the partly trained policy,
-a curriculum over the allowed divergence and the speed of the reference. Where we differ: see `APGConfig`.
+Wiedemann, Wuest, Loquercio, Mueller, Floreano and Scaramuzza (2023), "Training Efficient Controllers via Analytic
+Policy Gradient": receding horizon, all actions of the horizon planned at once, data collected by the partly trained
+policy, a curriculum over the allowed divergence and the speed of the reference. Where we differ: see `APGConfig`.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Policy checkpoints: weights, network shape and the contract with its robot, in one safetensors file.
 
-A safetensors file holds tensors and text; nothing in it is executed. The text says which robot, task and observation the
-weights were trained for, and a checkpoint is refused where that differs from what it is asked to fly.
+A safetensors file holds tensors and text; nothing in it is executed. The text says which robot, task and observation
+the weights were trained for, and a checkpoint is refused where that differs from what it is asked to fly.
 """
 
 import json

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import torch
 from tensordict import TensorDict
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from envs.env import TrackingEnv
 
@@ -48,26 +48,19 @@ def evaluate(actor, dynamics, task, episodes):
     """
     env = TrackingEnv(dynamics, task, episodes, batch_size=(len(episodes),), device=episodes.device)
     rows = torch.arange(len(episodes), device=episodes.device).unsqueeze(-1)
-    start = env.reset(TensorDict({"episode": rows}, batch_size=env.batch_size))
+    now = env.reset(TensorDict({"episode": rows}, batch_size=env.batch_size))
+    states, actions, done = [now["state"]], [], torch.zeros_like(now["done"])
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        flown = env.rollout(
-            task.steps, actor, auto_reset=False, tensordict=start, break_when_any_done=False, break_when_all_done=True
-        )
-    states = _held(flown["state"][:, :1], flown["next", "state"], flown["next", "done"].squeeze(-1))
-    missing = task.steps + 1 - states.shape[1]
-    states = torch.cat((states, states[:, -1:].expand(-1, missing, -1)), 1)
+        for _ in range(task.steps):
+            following = env.step(actor(now))
+            states.append(torch.where(done, states[-1], following["next", "state"]))
+            actions.append(following["action"])
+            done = done | following["next", "done"]
+            now = step_mdp(following)
+    states = torch.stack(states, 1)
     error, success = task.score(episodes, states)
     table = {"episode": range(len(episodes)), "error": error.cpu().numpy(), "success": success.cpu().numpy()}
-    return Evaluation(pd.DataFrame(table), task.metric, task.unit, states, flown["action"], episodes)
-
-
-def _held(first, following, done):
-    """Join the first state to the following ones and repeat, in each episode, the state at its end."""
-    ended = done.to(torch.int8).cumsum(-1)
-    last = torch.where(ended.any(-1), ended.bool().to(torch.int8).argmax(-1), done.shape[-1] - 1)
-    index = torch.minimum(torch.arange(done.shape[-1], device=done.device), last.unsqueeze(-1))
-    held = following.gather(1, index.unsqueeze(-1).expand(-1, -1, following.shape[-1]))
-    return torch.cat((first, held), 1)
+    return Evaluation(pd.DataFrame(table), task.metric, task.unit, states, torch.stack(actions, 1), episodes)
 
 
 def test_episodes(task, n=None, split="test", seed=0):
