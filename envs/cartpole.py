@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 
 from envs.references import split_generator
-from envs.system import System, Task
+from envs.system import Axis, System, Task
 
 FRICTION_SPEED = 0.05  # [m/s] the track friction has reached 76 % of its full value here
 
@@ -53,6 +53,13 @@ class CartPole(System):
         **dict.fromkeys(("gravity", "track_friction", "hinge_friction"), (-1e-9, math.inf)),
     }
     groups: ClassVar[dict[str, tuple[str, ...]]] = {"mass": ("cart_mass", "pole_mass")}
+    axes: ClassVar[dict[str, Axis]] = {
+        "x": Axis("cart position", "m"),
+        "v": Axis("cart velocity", "m/s"),
+        "theta": Axis("pole angle", "deg", 180 / math.pi),
+        "omega": Axis("pole rate", "rad/s"),
+    }
+    camera: ClassVar[tuple[float, float]] = (-90.0, 0.0)
 
     dt: float = 0.05  # [s] control period
     cart_mass: float = 1.0  # [kg] Barto et al.
@@ -98,6 +105,17 @@ class CartPole(System):
     def residual_inputs(self, x, u):
         return x.v, x.theta.sin(), x.theta.cos() - 1, x.omega, u.force
 
+    def place(self, x):
+        """The tip of the pole."""
+        length = 2 * self.pole_half_length
+        return x.x + length * math.sin(x.theta), 0 * x.x, length * math.cos(x.theta)
+
+    def outline(self, x, size):
+        """Cart and pole at their true size."""
+        width, height = 0.15, 0.15  # [m] half width and height of the cart, whose top is the hinge
+        corners = ((-width, 0), (width, 0), (width, -height), (-width, -height), (-width, 0))
+        return [[(x.x + dx, 0.0, dz) for dx, dz in corners], [(x.x, 0.0, 0.0), self.place(x)]]
+
 
 @dataclass(frozen=True)
 class Balance(Task):
@@ -115,6 +133,9 @@ class Balance(Task):
     sets: ClassVar[tuple[str, ...]] = ("balance",)
     encoder: ClassVar[str] = "none"
     thresholds: ClassVar[tuple[float, float]] = (0.05, 0.4)
+    views: ClassVar[tuple[tuple[str, str], ...]] = (("t", "v"), ("t", "theta"))
+    trace_name: ClassVar[str] = "cart speed"
+    trace_unit: ClassVar[str] = "m/s"
     angle_limit: ClassVar[float] = math.radians(24)  # [rad]
     rail: ClassVar[float] = 2.4  # [m] half length
 
@@ -144,6 +165,14 @@ class Balance(Task):
 
     def diverged(self, episodes, step, state):
         return ~((state[..., 2].abs() <= self.angle_limit) & (state[..., 0].abs() <= self.rail))
+
+    def path(self, episodes):
+        """At rest and upright, anywhere on the rail."""
+        rest = episodes.new_tensor([math.nan, 0.0, 0.0, 0.0])
+        return rest.expand(len(episodes), self.steps + 1, -1)
+
+    def trace(self, episodes, states):
+        return states[..., 1].abs()
 
     def score(self, episodes, states):
         failed = self.diverged(None, None, states)

@@ -13,7 +13,7 @@ import torch
 from envs import rigid_body
 from envs.quadrotor import attitude
 from envs.references import split_generator
-from envs.system import System, Task
+from envs.system import Axis, System, Task
 
 
 class State(NamedTuple):
@@ -78,6 +78,14 @@ class FixedWing(System):
     groups: ClassVar[dict[str, tuple[str, ...]]] = {
         "inertia": ("inertia_x", "inertia_y", "inertia_z", "inertia_xz"),
     }
+    axes: ClassVar[dict[str, Axis]] = {
+        **{"px": Axis("north", "m"), "py": Axis("east", "m"), "pz": Axis("altitude", "m", -1.0)},
+        "u_b": Axis("velocity forward", "m/s"),
+        "v_b": Axis("velocity right", "m/s"),
+        "w_b": Axis("velocity down", "m/s"),
+        **{rate: Axis(f"{name} rate", "rad/s") for rate, name in zip("pqr", ("roll", "pitch", "yaw"), strict=True)},
+    }
+    camera: ClassVar[tuple[float, float]] = (-70.0, 18.0)
 
     dt: float = 0.05  # [s] control period
     mass: float = 1.01  # [kg] this and what follows: reference implementation of Wiedemann, Wuest et al. (2023)
@@ -109,11 +117,10 @@ class FixedWing(System):
 
     def derivative(self, x, u):
         velocity, rates = (x.u_b, x.v_b, x.w_b), (x.p, x.q, x.r)
-        columns = rigid_body.rotation_columns(attitude(x))
-        gravity = tuple(self.gravity * column[2] for column in columns)
+        down = rigid_body.axis_z(rigid_body.inverse(attitude(x)))
         force, torque = self.wrench(x, u)
         turning = rigid_body.cross(rates, velocity)
-        linear = tuple(force[i] / self.mass + gravity[i] - turning[i] for i in range(3))
+        linear = tuple(force[i] / self.mass + self.gravity * down[i] - turning[i] for i in range(3))
         return State(
             *rigid_body.to_world(attitude(x), velocity),
             *rigid_body.quaternion_rates(attitude(x), rates),
@@ -166,8 +173,24 @@ class FixedWing(System):
 
     def residual_inputs(self, x, u):
         """Body velocity relative to a cruise of 11.5 m/s, direction of gravity in body axes, body rates, action."""
-        down = (column[2] for column in rigid_body.rotation_columns(attitude(x)))
+        down = rigid_body.axis_z(rigid_body.inverse(attitude(x)))
         return (x.u_b - CRUISE, x.v_b, x.w_b, *down, x.p, x.q, x.r, *u)
+
+    def place(self, x):
+        """North, west, up."""
+        return x.px, -x.py, -x.pz
+
+    def outline(self, x, size):
+        """Fuselage, wing, tail plane and fin."""
+        lines = (
+            ((0.9, 0, 0), (-0.9, 0, 0)),
+            ((0.25, -1, 0), (0.25, 1, 0)),
+            ((-0.8, -0.35, 0), (-0.8, 0.35, 0)),
+            ((-0.7, 0, 0), (-0.9, 0, -0.35), (-0.9, 0, 0)),
+        )
+        centre = self.place(x)
+        turned = [[rigid_body.to_world(attitude(x), [size * c for c in point]) for point in line] for line in lines]
+        return [[(centre[0] + n, centre[1] - e, centre[2] - d) for n, e, d in line] for line in turned]
 
     def project(self, x):
         unit = rigid_body.normalised(attitude(x))
@@ -197,6 +220,8 @@ class Waypoint(Task):
     sets: ClassVar[tuple[str, ...]] = ("waypoint",)
     encoder: ClassVar[str] = "linear"
     thresholds: ClassVar[tuple[float, float]] = (4.0, 20.0)
+    views: ClassVar[tuple[tuple[str, str], ...]] = (("px", "pz"), ("px", "py"))
+    trace_name: ClassVar[str] = "distance to straight line"
     limit: ClassVar[float] = 20.0  # [m] farther off the straight line is a failure
     nearest: ClassVar[float] = 1.0  # [m] the line is aimed as if the target were at least that far ahead
 
@@ -225,8 +250,8 @@ class Waypoint(Task):
     def observe(self, state):
         """Attitude columns, body velocity and body rates (B, 12); not the position."""
         x = State(*state.unbind(-1))
-        first, second, _ = rigid_body.rotation_columns(attitude(x))
-        return torch.stack((*first, *second, x.u_b, x.v_b, x.w_b, x.p, x.q, x.r), -1)
+        axes = (*rigid_body.axis_x(attitude(x)), *rigid_body.axis_y(attitude(x)))
+        return torch.stack((*axes, x.u_b, x.v_b, x.w_b, x.p, x.q, x.r), -1)
 
     def window(self, state, reference):
         """The last point of the reference relative to the aircraft (B, 1, 3)."""
@@ -243,6 +268,12 @@ class Waypoint(Task):
 
     def arrived(self, episodes, step, state):
         return state[..., 0] >= episodes[..., 0]
+
+    def path(self, episodes):
+        """The straight line to the target, where it ends."""
+        travelled = CRUISE * self.system.dt * torch.arange(self.steps + 1).to(episodes)
+        share = (travelled / episodes.norm(dim=-1, keepdim=True)).clamp(max=1)
+        return episodes[:, None] * share.unsqueeze(-1)
 
     def score(self, episodes, states):
         """Interpolates between the last state before the plane and the first behind it."""

@@ -13,7 +13,7 @@ import torch
 
 from envs import references, rigid_body
 from envs.errors import InputError
-from envs.system import System, Task
+from envs.system import Axis, System, Task
 
 
 class State(NamedTuple):
@@ -75,6 +75,11 @@ class Quadrotor(System):
         "thrust_loss": (-1.0, 1.0),
     }
     groups: ClassVar[dict[str, tuple[str, ...]]] = {"inertia": ("inertia_x", "inertia_y", "inertia_z")}
+    axes: ClassVar[dict[str, Axis]] = {
+        **{"px": Axis("x", "m"), "py": Axis("y", "m"), "pz": Axis("altitude", "m")},
+        **{f"v{axis}": Axis(f"velocity {axis}", "m/s") for axis in "xyz"},
+        **{rate: Axis(f"{name} rate", "rad/s") for rate, name in zip("pqr", ("roll", "pitch", "yaw"), strict=True)},
+    }
 
     dt: float = 0.1  # [s] control period, Wiedemann, Wuest et al. (2023)
     mass: float = 0.723  # [kg] reference implementation of the paper, like the inertia and the gains
@@ -128,7 +133,7 @@ class Quadrotor(System):
         mass, _ = self.believed
         thrust = (self.thrust_max + self.thrust_min) / 2 + (self.thrust_max - self.thrust_min) / 2 * u.thrust
         thrust = thrust * ((1 - self.thrust_loss) * mass / self.mass)
-        up = rigid_body.rotation_columns(attitude(x))[2]
+        up = rigid_body.axis_z(attitude(x))
         return State(
             *(x.vx, x.vy, x.vz),
             *rigid_body.quaternion_rates(attitude(x), (x.p, x.q, x.r)),
@@ -160,18 +165,32 @@ class Quadrotor(System):
 
     def residual_inputs(self, x, u):
         """Body velocity, direction of gravity in body axes, body rates, action: blind to position and heading."""
-        columns = rigid_body.rotation_columns(attitude(x))
-        velocity = tuple(rigid_body.dot(column, (x.vx, x.vy, x.vz)) for column in columns)
-        return (*velocity, *(column[2] for column in columns), x.p, x.q, x.r, *u)
+        velocity = rigid_body.to_body(attitude(x), (x.vx, x.vy, x.vz))
+        upward = rigid_body.axis_z(rigid_body.inverse(attitude(x)))
+        return (*velocity, *upward, x.p, x.q, x.r, *u)
 
     def residual_rates(self, x, residual):
         """Acceleration in body axes [m/s^2] and angular acceleration [rad/s^2]."""
         force = rigid_body.to_world(attitude(x), residual[:3])
         return dict(zip(self.accelerations, (*force, *residual[3:]), strict=True))
 
+    def outline(self, x, size):
+        """Two crossed arms with a rotor at each end."""
+        arm, rotor = 0.7 * size, 0.3 * size
+        ends = [(a * arm / math.sqrt(2), b * arm / math.sqrt(2)) for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
+        turns = [math.tau * i / 16 for i in range(17)]
+        lines = [[(*ends[i], 0.0), (*ends[i + 2], 0.0)] for i in range(2)]
+        lines += [[(a + rotor * math.cos(t), b + rotor * math.sin(t), 0.1 * size) for t in turns] for a, b in ends]
+        return [[_moved(x, point) for point in line] for line in lines]
+
     def project(self, x):
         unit = rigid_body.normalised(attitude(x))
         return x._replace(**dict(zip(("qw", "qx", "qy", "qz"), unit, strict=True)))
+
+
+def _moved(x, point):
+    """A point of the body in world coordinates."""
+    return tuple(a + b for a, b in zip((x.px, x.py, x.pz), rigid_body.to_world(attitude(x), point), strict=True))
 
 
 @dataclass(frozen=True)
@@ -200,6 +219,8 @@ class Tracking(Task):
     encoder: ClassVar[str] = "conv"
     thresholds: ClassVar[tuple[float, float]] = (0.1, 2.0)
     speeds: ClassVar[tuple[float, ...]] = (0.5, 0.75, 1.0)
+    views: ClassVar[tuple[tuple[str, str], ...]] = (("px", "py"), ("t", "pz"))
+    trace_name: ClassVar[str] = "position error"
     limit: ClassVar[float] = 5.0  # [m] farther off the reference is a failure
 
     system: Quadrotor = Quadrotor()
@@ -232,10 +253,9 @@ class Tracking(Task):
 
     def observe(self, state):
         x = State(*state.unbind(-1))
-        first, second, third = rigid_body.rotation_columns(attitude(x))
-        velocity = (x.vx, x.vy, x.vz)
-        body = tuple(rigid_body.dot(column, velocity) for column in (first, second, third))
-        return torch.stack((*velocity, *body, *first, *second, x.p, x.q, x.r), -1)
+        q, velocity = attitude(x), (x.vx, x.vy, x.vz)
+        axes = (*rigid_body.axis_x(q), *rigid_body.axis_y(q))
+        return torch.stack((*velocity, *rigid_body.to_body(q, velocity), *axes, x.p, x.q, x.r), -1)
 
     def window(self, state, reference):
         """Reference positions and velocities (B, H, 6) less those of a robot that keeps its present velocity.

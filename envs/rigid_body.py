@@ -7,25 +7,40 @@ Stevens, Lewis and Johnson (2016), "Aircraft Control and Simulation", ch. 1.
 """
 
 
-def rotation_columns(q):
-    """The body axes in world coordinates: the three columns of the rotation matrix, each a 3-tuple."""
+def axis_x(q):
+    """The body x axis in world coordinates: the first column of the rotation matrix."""
     w, x, y, z = q
-    first = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
-    second = (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x))
-    third = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))
-    return first, second, third
+    return 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
+
+
+def axis_y(q):
+    """The body y axis in world coordinates: the second column of the rotation matrix."""
+    w, x, y, z = q
+    return 2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)
+
+
+def axis_z(q):
+    """The body z axis in world coordinates: the third column of the rotation matrix."""
+    w, x, y, z = q
+    return 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
+
+
+def inverse(q):
+    """The quaternion of the opposite rotation."""
+    return q[0], -q[1], -q[2], -q[3]
 
 
 def to_world(q, vector):
-    """A body vector in world coordinates."""
-    a, b, c = rotation_columns(q)
-    vx, vy, vz = vector
-    return tuple(a[i] * vx + b[i] * vy + c[i] * vz for i in range(3))
+    """A body vector in world coordinates: v + w t + u x t with t = 2 u x v, fewer operations than by the matrix."""
+    w, *axis = q
+    twice = tuple(2 * c for c in cross(axis, vector))
+    turned = cross(axis, twice)
+    return tuple(v + w * t + c for v, t, c in zip(vector, twice, turned, strict=True))
 
 
 def to_body(q, vector):
     """A world vector in body coordinates."""
-    return tuple(dot(column, vector) for column in rotation_columns(q))
+    return to_world(inverse(q), vector)
 
 
 def quaternion_rates(q, rates):
@@ -50,8 +65,3 @@ def normalised(q):
 def cross(a, b):
     """The vector product a x b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def dot(a, b):
-    """The scalar product of two 3-tuples."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

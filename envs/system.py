@@ -9,11 +9,19 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 
 from envs.errors import InputError
+
+
+class Axis(NamedTuple):
+    """How a state is shown to people: in words, and as `factor` times its value in `unit`."""
+
+    label: str
+    unit: str
+    factor: float = 1.0  # -1 turns a coordinate that points down into an altitude
 
 
 @dataclass(frozen=True)
@@ -29,6 +37,8 @@ class System(ABC):
     accelerations: ClassVar[tuple[str, ...]]  # state rows that a force or torque acts on
     bounds: ClassVar[dict[str, tuple[float, float]]] = {}  # open interval of each checked parameter
     groups: ClassVar[dict[str, tuple[str, ...]]] = {}  # one name for several fields that are scaled together
+    axes: ClassVar[dict[str, Axis]] = {}  # how states are shown; those without one go by their name
+    camera: ClassVar[tuple[float, float]] = (-60.0, 25.0)  # [deg] azimuth and elevation it is filmed from
 
     dt: float  # [s] control period
 
@@ -69,9 +79,20 @@ class System(ABC):
         """The same robot with its controller's beliefs fixed, so that a changed airframe no longer changes them."""
         return self
 
+    def place(self, x):
+        """Where the robot is seen, (x, y, z) with z up [m]: the point whose trail is drawn."""
+        return tuple(getattr(x, name, 0 * x[0]) for name in ("px", "py", "pz"))
+
+    def outline(self, x, size):
+        """Lines to draw the robot by, each a list of points (x, y, z), z up [m]; `size` [m] is how large it may appear.
+
+        A robot that is as large as what it moves in ignores `size`.
+        """
+        return []
+
     @property
     def trim_action(self):
-        """The action that keeps the robot at rest or in steady flight, as an `Action` of floats."""
+        """The action that costs nothing, as an `Action` of floats: hover, or the middle of every range."""
         return self.Action(*(0.0 for _ in self.Action._fields))
 
 
@@ -93,6 +114,9 @@ class Task(ABC):
     encoder: ClassVar[str]  # how a policy reads the reference: "conv", "linear" or "none"
     thresholds: ClassVar[tuple[float, float]]  # first and last divergence threshold of the curriculum
     speeds: ClassVar[tuple[float, ...]] = (1.0,)  # speeds of the curriculum
+    views: ClassVar[tuple[tuple[str, str], ...]] = ()  # pictures of a flight: pairs of states, or "t" and a state
+    trace_name: ClassVar[str] = "distance to reference"  # what `trace` is
+    trace_unit: ClassVar[str] = "m"
 
     system: System
     set: str
@@ -138,6 +162,20 @@ class Task(ABC):
     @abstractmethod
     def score(self, episodes, states):
         """Metric (B,) and success (B,) of the flown states (B, steps + 1, n); what follows an end is to be ignored."""
+
+    def path(self, episodes):
+        """The reference (N, steps + 1, r) to draw, NaN where nothing is prescribed; default: where `start` stands."""
+        places = [self.system.State._fields.index(name) for name in self.reference_names]
+        return self._over_time(lambda step: self.start(episodes, step)[:, places], episodes)
+
+    def trace(self, episodes, states):
+        """The error (N, steps + 1) over time to draw of flown states (N, steps + 1, n)."""
+        return self._over_time(lambda step: self.distance(episodes, step, states[:, int(step[0])]), episodes)
+
+    def _over_time(self, function, episodes):
+        """Stack what a function of a step (N,) gives at every step of the task."""
+        steps = torch.arange(self.steps + 1, device=episodes.device)
+        return torch.stack([function(step.expand(len(episodes))) for step in steps], 1)
 
     def cost(self, state, action, reference):
         """Weighted squared deviations (...) of state (..., n) from reference (..., r) and of action from trim."""
