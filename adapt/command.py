@@ -6,6 +6,7 @@ import io
 import json
 import os
 import re
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -92,6 +93,60 @@ def write_json(path, content):
         partial.write_text(json.dumps(content, indent=2) + "\n")
 
 
+def pick_robot(name, vehicle):
+    """The system that `--system` and `--vehicle` name, and the vehicle or None.
+
+    Raises:
+        InputError: when either is unknown, or the vehicle is another kind of robot.
+    """
+    from envs.registry import make_system
+
+    system = make_system(name)
+    if vehicle is None:
+        return system, None
+    from envs.vehicles import load_vehicle
+
+    own = load_vehicle(vehicle)
+    if own.system.name != system.name:
+        raise InputError(f"--vehicle {vehicle}: is a {own.system.name}, --system says {system.name}")
+    return own.system, own
+
+
+def pick_policy(path, system, vehicle):
+    """The policy at `path`, or the one that ships for the robot.
+
+    Raises:
+        InputError: when there is none, or it was trained for another robot.
+    """
+    from policies.checkpoints import load_policy, pretrained
+
+    name = vehicle.name if vehicle else system.name
+    if path is None and pretrained(name) is None:
+        option = "vehicle" if vehicle else "system"
+        raise InputError(f"--policy: none ships for {name}; train one with python -m adapt.pretrain --{option} {name}")
+    return load_policy(path or name, system)
+
+
+@contextlib.contextmanager
+def interrupts_noted():
+    """Put Ctrl-C off to where a run is whole: yields a function that says whether one came.
+
+    A second Ctrl-C ends the run where it is.
+    """
+    came = []
+
+    def note(number, frame):
+        if came:
+            raise KeyboardInterrupt
+        came.append(number)
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: bool(came)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def set_threads(threads):
     """Threads for torch; small batches run fastest on one.
 
@@ -115,7 +170,7 @@ def pick_device(name):
 
     try:
         device = torch.device(name)
-        torch.zeros(1, device=device)
+        torch.zeros(1, device=device).item()  # a device that holds no data, such as meta, fails here
     except (RuntimeError, AssertionError) as error:
         raise InputError(f"--device {name}: not available here ({str(error).splitlines()[0]})") from None
     return device

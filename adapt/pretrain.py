@@ -4,10 +4,14 @@ import csv
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from adapt import command
 from envs.errors import InputError
 
+OUTPUTS = ("policy.safetensors", "log.csv", "training.pt")
 LOG = ("update", "seconds", "cost", "gradient_norm", "threshold", "stage", "resets", "skipped", "error", "success")
 
 
@@ -23,8 +27,8 @@ class Options:
     """Robot: cartpole, quadrotor or fixed_wing."""
     vehicle: str | None = None
     """Parameters of your own robot: a shipped name such as crazyflie, or a TOML file."""
-    target: tuple[str, ...] = ()
-    """Train in a changed robot, such as drag=0.3 mass=x1.2."""
+    target: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """Train in a changed robot, such as drag=0.3 or mass=x1.2; may be repeated."""
     set: str | None = None
     """Family of training episodes (quadrotor: paper, fast)."""
     seed: int = 0
@@ -70,11 +74,14 @@ def main(options):
 
     command.set_threads(options.threads)
     device = command.pick_device(options.device)
-    system = _system(options)
+    if options.every < 1:
+        raise InputError(f"--every {options.every}: expected at least 1")
+    system, _ = command.pick_robot(options.system, options.vehicle)
     config = configuration(options, system)
     task = make_task(system, options.set)
-    folder = _folder(options, system)
     dynamics = make_dynamics(system, options.target)
+    folder = _folder(options, system)
+    identity = _identity(options, task, config)
     banks = apg.training_banks(task, config, options.seed, device)
     run = apg.begin(dynamics, task, banks, config, options.seed)
     report = {
@@ -83,10 +90,10 @@ def main(options):
         **command.environment(options.seed, options.threads),
     }
     if options.resume:
-        run.load_state_dict(_saved(folder, config), banks, config, task)
+        run.load_state_dict(_saved(folder, identity), banks, config, task)
     command.write_json(folder / "config.json", report)
     torch.manual_seed(options.seed)
-    _train(run, dynamics, task, banks, config, options, folder)
+    _train(run, dynamics, task, banks, config, options, folder, identity)
 
 
 def configuration(options, system):
@@ -101,20 +108,6 @@ def configuration(options, system):
     return replace(apg.PRESETS.get(name, apg.APGConfig()), **changes)
 
 
-def _system(options):
-    from envs import make_system
-
-    system = make_system(options.system)
-    if options.vehicle is None:
-        return system
-    from envs.vehicles import load_vehicle
-
-    vehicle = load_vehicle(options.vehicle)
-    if vehicle.system.name != system.name:
-        raise InputError(f"--vehicle {options.vehicle}: is a {vehicle.system.name}, --system says {system.name}")
-    return vehicle.system
-
-
 def _folder(options, system):
     name = (options.vehicle and Path(options.vehicle).stem) or system.name
     path = Path(options.out or f"runs/pretrain-{name}-seed{options.seed}")
@@ -122,31 +115,44 @@ def _folder(options, system):
         if not (path / "training.pt").is_file():
             raise InputError(f"--resume: {path} holds no training.pt to continue from")
         return path
-    return command.output_folder(path, options.overwrite)
+    folder = command.output_folder(path, options.overwrite)
+    for name in OUTPUTS:  # what an earlier run left must not be taken for this one's
+        (folder / name).unlink(missing_ok=True)
+    return folder
 
 
-def _saved(folder, config):
+def _identity(options, task, config):
+    """What must not change where a run is continued."""
+    robot = {"system": task.system.name, "vehicle": repr(task.system), "target": " ".join(options.target)}
+    return {**robot, "set": task.set, "seed": options.seed, **asdict(config)}
+
+
+def _saved(folder, identity):
     import torch
 
-    saved = torch.load(folder / "training.pt", weights_only=True)
-    if saved["config"] != asdict(config):
-        changed = [key for key, value in asdict(config).items() if saved["config"].get(key) != value]
-        raise InputError(f"--resume: {folder} was trained with other settings of {', '.join(changed)}; give the same")
+    path = folder / "training.pt"
+    try:
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+        then = saved["identity"]
+    except Exception:  # torch raises many kinds; weights_only refuses whatever is more than tensors
+        raise InputError(f"--resume: {path} is damaged or not of this command; start again without --resume") from None
+    if changed := [key for key, value in identity.items() if then.get(key) != value]:
+        raise InputError(f"--resume: {folder} was trained with another {', '.join(changed)}; give the same")
     return saved
 
 
-def _train(run, dynamics, task, banks, config, options, folder):
+def _train(run, dynamics, task, banks, config, options, folder, identity):
     from tqdm import tqdm
 
     from policies import apg
 
-    log = Log(folder, keep=options.resume)
+    log = Log(folder, until=run.update)
     best = log.best()
     begin = time.perf_counter() - log.seconds()
     flown = compiled(dynamics) if options.compile else dynamics
     bar = tqdm(total=config.updates, initial=run.update, desc=f"training {task.system.name}", unit="update")
     try:
-        for metrics in apg.train(run, flown, task, banks, config):
+        for metrics in _until_interrupted(run, apg.train(run, flown, task, banks, config), folder, identity):
             bar.update()
             if run.update % options.every and run.update != config.updates:
                 continue
@@ -160,12 +166,9 @@ def _train(run, dynamics, task, banks, config, options, folder):
             }
             log.write(row)
             best = _keep_best(run, task, options, folder, row, best)
-            _save_training(run, config, folder)
+            _save_training(run, folder, identity)
             if options.stop_at is not None and result["mean"] <= options.stop_at and result["success"] == 1:
                 break
-    except KeyboardInterrupt:
-        _save_training(run, config, folder)
-        raise KeyboardInterrupt(f"continue with --resume --out {folder}") from None
     finally:
         bar.close()
         log.close()
@@ -173,6 +176,16 @@ def _train(run, dynamics, task, banks, config, options, folder):
         print(f"{run.skipped} updates were skipped because their gradient was not finite")
     result = f"validation error {best[1]:.4f} {task.unit}, success {-best[0]:.2f}"
     print(f"{folder}/policy.safetensors: {result}, {time.perf_counter() - begin:.0f} s")
+
+
+def _until_interrupted(run, updates, folder, identity):
+    """The updates of a run; Ctrl-C waits for the present one, so that the run that is saved can go on exactly."""
+    with command.interrupts_noted() as interrupted:
+        for metrics in updates:
+            yield metrics
+            if interrupted():
+                _save_training(run, folder, identity)
+                raise KeyboardInterrupt(f"continue with --resume --out {folder}")
 
 
 def validate(network, dynamics, task, n=100):
@@ -202,7 +215,7 @@ def _keep_best(run, task, options, folder, row, best):
     """Save the policy if it succeeds more often than the best so far, or as often and more accurately."""
     from policies.checkpoints import save_policy
 
-    score = (-row["success"], row["error"] if row["error"] == row["error"] else float("inf"))
+    score = _score(row)
     if score >= best:
         return best
     info = {"validation": score[1], "success": row["success"], "unit": task.unit, "update": row["update"]}
@@ -211,19 +224,26 @@ def _keep_best(run, task, options, folder, row, best):
     return score
 
 
-def _save_training(run, config, folder):
+def _score(row):
+    """(minus success, error) of a row: the smaller, the better. Without any success there is no error."""
+    error = float(row["error"])
+    return -float(row["success"]), error if error == error else float("inf")
+
+
+def _save_training(run, folder, identity):
     import torch
 
     with command.whole(folder / "training.pt") as partial:
-        torch.save({**run.state_dict(), "config": asdict(config)}, partial)
+        torch.save({**run.state_dict(), "identity": identity}, partial)
 
 
 class Log:
     """log.csv, and TensorBoard where it is installed."""
 
-    def __init__(self, folder, keep):
+    def __init__(self, folder, until):
         path = folder / "log.csv"
-        self.rows = list(csv.DictReader(path.open())) if keep and path.is_file() else []
+        rows = list(csv.DictReader(path.read_text().splitlines())) if path.is_file() else []
+        self.rows = [row for row in rows if int(row["update"]) <= until]  # the rest will be done again
         self.path, self.board = path, _tensorboard(folder)
 
     def write(self, row):
@@ -239,8 +259,7 @@ class Log:
 
     def best(self):
         """Best (minus success, error) so far."""
-        scores = [(-float(row["success"]), float(row["error"])) for row in self.rows]
-        return min((s for s in scores if s[1] == s[1]), default=(0.0, float("inf")))
+        return min((_score(row) for row in self.rows), default=(1.0, float("inf")))
 
     def seconds(self):
         """Time spent before this run was resumed."""

@@ -15,6 +15,12 @@ from envs.errors import InputError
 from policies.networks import network_for
 
 
+OPTIMIZERS = {
+    "adam": lambda parameters: torch.optim.Adam(parameters),
+    "sgd": lambda parameters: torch.optim.SGD(parameters, momentum=0.9),
+}
+
+
 @dataclass(frozen=True)
 class APGConfig:
     """Settings of a training run.
@@ -38,13 +44,18 @@ class APGConfig:
 
     def __post_init__(self):
         for name in ("updates", "batch", "width", "learning_rate", "clip", "episodes"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"--config.{name.replace('_', '-')} {getattr(self, name)}: expected more than 0")
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"--{name.replace('_', '-')} {getattr(self, name)}: expected more than 0")
+        for name in ("final_rate", "warmup", "curriculum", "exploration"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"--{name.replace('_', '-')} {getattr(self, name)}: expected between 0 and 1")
+        if self.optimizer not in OPTIMIZERS:
+            raise InputError(f"optimizer {self.optimizer!r}: expected one of {', '.join(OPTIMIZERS)}")
 
 
 PRESETS = {
-    "cartpole": APGConfig(updates=3000),
-    "quadrotor": APGConfig(updates=6000, width=128, learning_rate=1e-2),
+    "cartpole": APGConfig(updates=2000),
+    "quadrotor": APGConfig(updates=4000, width=128, learning_rate=1e-2, curriculum=0.3),
     "fixed_wing": APGConfig(updates=2000),
     "paper": APGConfig(
         updates=20000,
@@ -162,7 +173,7 @@ class Training:
         self.update, self.skipped = saved["update"], saved["skipped"]
         self.flight.episodes = banks[stage(config, task, len(banks), max(0, self.update - 1))[1]]
         for name, value in saved["flight"].items():
-            setattr(self.flight, name, value)
+            setattr(self.flight, name, value.to(self.flight.episodes.device))
 
 
 def begin(dynamics, task, banks, config, seed, network=None):
@@ -173,9 +184,8 @@ def begin(dynamics, task, banks, config, seed, network=None):
             torch.manual_seed(seed)
             network = network_for(task, features=config.width, widths=(config.width,) * 3).to(banks[0].device)
         normalise(network, task, dynamics, banks[-1], generator)
-    kinds = {"adam": lambda p: torch.optim.Adam(p), "sgd": lambda p: torch.optim.SGD(p, momentum=0.9)}
     flight = Flight(task, dynamics, banks[0], config.batch, generator)
-    return Training(network, kinds[config.optimizer](network.parameters()), flight, generator)
+    return Training(network, OPTIMIZERS[config.optimizer](network.parameters()), flight, generator)
 
 
 def training_banks(task, config, seed, device="cpu"):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from envs.errors import InputError
 from envs.registry import make_system, make_task
@@ -42,8 +42,11 @@ def save_policy(path, network, task, info):
     path = Path(path)
     partial = path.with_name(f".{path.name}.partial")
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
-    save_file(tensors, partial, metadata)
-    os.replace(partial, path)
+    try:
+        partial.write_bytes(save(tensors, metadata))
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def read_tensors(path, format, what):
@@ -89,14 +92,17 @@ def load_policy(source, system=None):
         task = make_task(trained_for, **json.loads(metadata["task"]))
         network = PlanNetwork(config)
         network.load_state_dict(tensors)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        info = json.loads(metadata["info"])
+    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise InputError(
             f"policy {path}: damaged or made by another version ({' '.join(str(error).split())})"
         ) from None
     if system is not None:
         _check_system(path, trained_for, system)
     _check_contract(path, config, task)
-    return Policy(network.requires_grad_(True), task, json.loads(metadata["info"]))
+    if not all(torch.isfinite(tensor).all() for tensor in tensors.values()):
+        raise InputError(f"policy {path}: holds weights that are not finite; train it again")
+    return Policy(network.requires_grad_(True), task, info)
 
 
 def _system(values):
@@ -123,7 +129,8 @@ def _check_contract(path, config, task):
     episodes, step = task.episodes(1, "train", 0), torch.zeros(1, dtype=torch.long)
     state = task.start(episodes, step)
     window = task.window(state, task.reference(episodes, step, state))
-    wanted = (task.observe(state).shape[-1], tuple(window.shape[-2:]), len(task.system.Action._fields))
-    found = (config.observations, config.window, config.actions)
+    wanted = (task.observe(state).shape[-1], tuple(window.shape[-2:]), len(task.system.Action._fields), task.horizon)
+    found = (config.observations, config.window, config.actions, config.horizon)
     if wanted != found:
-        raise InputError(f"policy {path}: made for observation, window and action sizes {found}, the task has {wanted}")
+        sizes = "observation, window, action and horizon"
+        raise InputError(f"policy {path}: made for {sizes} of sizes {found}, the task has {wanted}; train it again")

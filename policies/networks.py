@@ -7,6 +7,8 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 
+from envs.errors import InputError
+
 ENCODERS = ("conv", "linear", "none")
 
 
@@ -33,6 +35,8 @@ class PlanNetwork(nn.Module):
 
     def __init__(self, config: NetworkConfig):
         super().__init__()
+        if config.encoder not in ENCODERS:
+            raise InputError(f"encoder {config.encoder!r}: expected one of {', '.join(ENCODERS)}")
         self.config = config
         points, entries = config.window
         self.register_buffer("observation_mean", torch.zeros(config.observations))

@@ -1,0 +1,292 @@
+"""Adapt a policy from few transitions: `python -m adapt.fewshot --samples 1000`.
+
+Flies the policy in a target domain (or reads recorded flights), learns what the model lacks, fine-tunes the policy in
+the corrected model, and shows with numbers and pictures what that was worth.
+"""
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from adapt import command
+from envs.errors import InputError
+
+OUTPUTS = ("config.json", "metrics.json", "policy.safetensors", "residual.safetensors", "transitions.csv")
+DEFAULT_TARGET = ("drag=0.3",)
+NAMES = {"source": "source", "zero_shot": "zero-shot", "few_shot": "few-shot", "oracle": "oracle"}
+Repeatable = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Adapt a policy to a target from few transitions and show what it was worth.
+
+    Writes metrics.json, config.json, policy.safetensors, residual.safetensors, transitions.csv and pictures.
+    """
+
+    samples: int = 1000
+    """Transitions to fly in the target."""
+    system: str = "quadrotor"
+    """Robot: cartpole, quadrotor or fixed_wing."""
+    target: Repeatable = ()
+    """What is different in the target, such as drag=0.3 or mass=x1.2; may be repeated (default: drag=0.3)."""
+    policy: str | None = None
+    """Checkpoint to start from (default: the one that ships for the robot)."""
+    set: str | None = None
+    """Family of episodes (quadrotor: paper, fast, circle, lemniscate, line, hover, or a CSV of waypoints)."""
+    residual: str = "acceleration"
+    """Kind of residual: acceleration, or state as in the paper."""
+    exploration: float = 0.1
+    """Standard deviation of noise on the actions flown for data, which span -1 to 1."""
+    updates: int = 200
+    """Gradient steps of the fine-tuning."""
+    oracle: bool = False
+    """Also fine-tune in the true target, as a bound."""
+    seed: int = 0
+    """Seed of everything that is drawn."""
+    transitions: str | None = None
+    """Learn from recorded transitions (CSV or safetensors, as this command writes them) instead of flying."""
+    vehicle: str | None = None
+    """Parameters of your own robot: a shipped name such as crazyflie, or a TOML file."""
+    log: Repeatable = ()
+    """Learn from a flight log; may be repeated."""
+    validate: Repeatable = ()
+    """Flight logs to report the prediction error on; may be repeated."""
+    mapping: str = "auto"
+    """Column mapping of the logs: a shipped name, a TOML file, or auto."""
+    out: str | None = None
+    """Folder for the results (default: runs/fewshot-SYSTEM-TARGET-nSAMPLES-seedN)."""
+    overwrite: bool = False
+    """Replace what the folder holds."""
+    video: bool = False
+    """Also write an MP4 of the flight before and after."""
+    device: str = "cpu"
+    """Where to compute: cpu, cuda."""
+    threads: int = 1
+    """Threads of torch; small batches run fastest on one."""
+
+
+def main(options):
+    """Check the options, adapt, print, write."""
+    _check(options)
+    command.set_threads(options.threads)
+    device = command.pick_device(options.device)
+    setting = _setting(options)
+    policy = _policy(options, setting)
+    recorded, validation = _recorded(options, setting)
+    folder = command.output_folder(options.out or _default_folder(options), options.overwrite)
+    for name in OUTPUTS:  # what an earlier run left must not be taken for this one's
+        (folder / name).unlink(missing_ok=True)
+    adaptation = _adapt(options, setting, policy, recorded, folder, device)
+    metrics = _metrics(options, policy, adaptation, validation)
+    command.write_json(folder / "metrics.json", metrics)
+    print(_table(metrics))
+    _pictures(options, adaptation, folder)
+    print(f"results in {folder}/: metrics.json, policy.safetensors, residual.safetensors, transitions.csv, pictures")
+
+
+def _check(options):
+    if options.updates < 1:
+        raise InputError(f"--updates {options.updates}: expected at least 1")
+    if not 0 <= options.exploration <= 1:
+        raise InputError(f"--exploration {options.exploration:g}: expected between 0 and 1")
+    if options.oracle and options.transitions and not options.target:
+        raise InputError("--oracle: needs --target, in which it can fly; recorded transitions are not enough")
+    if options.log and options.transitions:
+        raise InputError("--log and --transitions: give one of the two")
+    if options.log and not options.vehicle:
+        raise InputError("--log: needs --vehicle, which says what the motor commands mean")
+    if options.validate and not options.log:
+        raise InputError("--validate: needs --log to learn from")
+    if options.log and (options.target or options.oracle):
+        raise InputError("--log: a recorded flight is the target; leave out --target and --oracle")
+    from adapt.residual import MINIMUM, RESIDUALS
+
+    if options.residual not in RESIDUALS:
+        raise InputError(f"--residual {options.residual}: expected one of {', '.join(RESIDUALS)}")
+    if options.samples < MINIMUM:
+        raise InputError(f"--samples {options.samples}: a residual needs at least {MINIMUM} transitions")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The robot as modelled and, unless only logs tell of it, the target."""
+
+    system: object
+    vehicle: object | None
+    target: object | None
+
+
+def _setting(options):
+    from envs.registry import make_dynamics
+
+    system, vehicle = command.pick_robot(options.system, options.vehicle)
+    if _recorded_only(options):
+        return Setting(system, vehicle, None)
+    return Setting(system, vehicle, make_dynamics(system, options.target or DEFAULT_TARGET))
+
+
+def _policy(options, setting):
+    from envs.registry import make_task
+
+    policy = command.pick_policy(options.policy, setting.system, setting.vehicle)
+    if options.set is None:
+        return policy
+    task = make_task(setting.system, options.set, horizon=policy.task.horizon)
+    return replace(policy, task=task)
+
+
+def _recorded(options, setting):
+    """Transitions to learn from and to validate on, where the options name some."""
+    if options.transitions:
+        from adapt.residual import MINIMUM
+        from adapt.transitions import Transitions
+
+        return Transitions.load(options.transitions, setting.system, MINIMUM), None
+    if not options.log:
+        return None, None
+    return _flights(options.log, options, setting), _flights(options.validate, options, setting)
+
+
+def _flights(paths, options, setting):
+    from adapt.logs import flight_transitions, read_flight
+
+    if not paths:
+        return None
+    logs = [read_flight(path, setting.vehicle, options.mapping) for path in paths]
+    for log in logs:
+        print(log.report)
+    return flight_transitions(logs)
+
+
+def _default_folder(options):
+    robot = Path(options.vehicle).stem if options.vehicle else options.system
+    text = "-".join((robot, *_target_text(options).split()))
+    text = "".join(c if c.isalnum() or c in "-_.=," else "-" for c in text)
+    return f"runs/fewshot-{text}-n{options.samples}-seed{options.seed}"
+
+
+def _adapt(options, setting, policy, recorded, folder, device):
+    from tqdm import tqdm
+
+    from adapt.finetune import FINETUNE, adapt
+    from policies.checkpoints import save_policy
+
+    report = {"options": asdict(options), **command.environment(options.seed, options.threads)}
+    command.write_json(folder / "config.json", report)
+
+    def keep(name, result):
+        if name == "transitions":
+            result.save(folder / "transitions.csv")
+        elif name == "residual":
+            result.save(folder / "residual.safetensors")
+        else:
+            save_policy(folder / "policy.safetensors", result.network, result.task, result.info)
+
+    policy.network.to(device)
+    try:
+        return adapt(
+            policy,
+            setting.target,
+            samples=options.samples,
+            transitions=recorded,
+            kind=options.residual,
+            exploration=options.exploration,
+            seed=options.seed,
+            config=replace(FINETUNE, updates=options.updates),
+            oracle=options.oracle,
+            context=None if recorded is None or recorded.context is None else recorded.context.mean(0),
+            progress=lambda updates: tqdm(updates, total=options.updates, desc="fine-tuning", unit="update"),
+            stage=lambda name: print(f"{name} ...", flush=True),
+            keep=keep,
+        )
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"what was finished is in {folder}") from None
+
+
+def _metrics(options, policy, adaptation, validation):
+    task, fit = policy.task, adaptation.fit
+    metrics = {
+        "system": options.vehicle or task.system.name,
+        "target": _target_text(options),
+        "metric": task.metric,
+        "unit": task.unit,
+        "samples": len(adaptation.transitions),
+        "seed": options.seed,
+        **{name: evaluation.summary for name, evaluation in adaptation.evaluations.items()},
+        "prediction": adaptation.prediction,
+        "residual": {"kind": fit.kind, "inputs": fit.inputs, "network": fit.network, "warnings": fit.warnings},
+        "seconds": adaptation.seconds,
+        "threads": options.threads,
+    }
+    if _recorded_only(options):
+        metrics["evaluated_in"] = "model + residual"
+    if validation is not None:
+        from adapt.prediction import prediction_report
+        from envs.dynamics import Dynamics
+
+        learned = adaptation.residual.to("cpu")
+        both = {"model": Dynamics(task.system), "model + residual": learned}
+        metrics["validation"] = {name: prediction_report(dynamics, validation) for name, dynamics in both.items()}
+        metrics["validation"]["n"] = len(validation)
+    return metrics
+
+
+def _recorded_only(options):
+    """Whether the target is known by its recorded transitions alone, so that nothing can be flown in it."""
+    return bool(options.log or (options.transitions and not options.target))
+
+
+def _target_text(options):
+    if _recorded_only(options):
+        return " ".join(Path(path).name for path in options.log or (options.transitions,))
+    return " ".join(options.target or DEFAULT_TARGET)
+
+
+def _table(metrics):
+    from tabulate import tabulate
+
+    rows = [
+        (text, f"{m['mean']:.4f} ± {m['std']:.4f}", f"{m['success']:.2f}", m["n"])
+        for name, text in NAMES.items()
+        if (m := metrics.get(name))
+    ]
+    flights = tabulate(rows, (metrics["target"], f"{metrics['metric']} [{metrics['unit']}]", "success", "N"), "simple")
+    parts = [flights]
+    for title, key in (("held-out transitions, one step", "prediction"), ("validation flights", "validation")):
+        if key in metrics:
+            before, after = metrics[key]["model"], metrics[key]["model + residual"]
+            rows = [(UNITS.get(name, name), before[name], after[name]) for name in before]
+            parts.append(tabulate(rows, (title, "model", "model + residual"), "simple", floatfmt=".3g"))
+    spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in metrics["seconds"].items())
+    parts.append(f"seconds ({metrics['threads']} thread{'s' * (metrics['threads'] > 1)}): {spent}")
+    parts.extend(f"note: {warning}" for warning in metrics["residual"]["warnings"])
+    return "\n\n" + "\n\n".join(parts) + "\n"
+
+
+UNITS = {
+    "position": "position [m]",
+    "velocity": "velocity [m/s]",
+    "attitude": "attitude [-]",
+    "rates": "body rates [rad/s]",
+    "acceleration": "acceleration [m/s^2]",
+    "angular_acceleration": "angular acceleration [rad/s^2]",
+    "position_1s": "position after 1 s [m]",
+    "velocity_1s": "velocity after 1 s [m/s]",
+}
+
+
+def _pictures(options, adaptation, folder):
+    from adapt.plots import draw_all
+
+    draw_all(adaptation, folder)
+    if options.video:
+        from adapt.video import write_video
+
+        write_video(adaptation, folder / "flight.mp4")
+
+
+if __name__ == "__main__":
+    command.run("adapt.fewshot", Options, main)
