@@ -11,7 +11,7 @@ import torch
 
 from adapt.residual_dynamics import (
     RESIDUALS,
-    SPEED_PREFIX,
+    SPEED,
     AccelerationResidual,
     ResidualConfig,
     ResidualDynamics,
@@ -43,9 +43,9 @@ class FitSettings:
     network: bool = True
     hidden: int = 64  # width of the network
     held_out: float = 0.2  # share of the trajectories that validates
-    steps: int = 600  # most gradient steps of the network
+    steps: int = 500  # most gradient steps of the network
     patience: int = 150  # steps without improvement before it stops
-    batch: int = 1024  # transitions in a gradient step
+    batch: int = 512  # transitions in a gradient step
     rate: float = 1e-2  # Adam's first learning rate
     decay: float = 1e-4  # pull of the network's weights to zero
     left: float = 1e-2  # share of the signal that the linear part must leave for a network to be tried
@@ -80,17 +80,18 @@ def fit_residual(transitions, base, kind="acceleration", seed=0, settings=FitSet
         the fitted `ResidualDynamics`, whose context is unset if it has any, and a `FitReport`.
 
     Raises:
-        InputError: unknown kind, fewer than `MINIMUM` transitions, another system or control period, a number that isn't
-            finite, or a state from which the model's own prediction isn't.
+        InputError: unknown kind, fewer than `MINIMUM` transitions, another system or control period, a number that
+            isn't finite, or a state from which the model's own prediction isn't.
     """
     began = time.perf_counter()
     check(transitions, base.system, MINIMUM)
     generator = torch.Generator().manual_seed(seed)
     data = _in_double(transitions)
-    config = ResidualConfig(kind, settings.hidden if settings.network else 0, transitions.context_names)
-    residual = make_residual(base, config, generator)
+    names = transitions.context_names
+    config = ResidualConfig(kind, settings.hidden if settings.network else 0, names, (SPEED, *names))
     _check_prediction(base, data)
-    train, held = data.split(1 - settings.held_out, generator)
+    train, held = data.split(1 - settings.held_out, generator)  # before the network draws its weights
+    residual = make_residual(base, config, generator)
     choice, after = FITS[kind](residual, data, train, held, settings, generator)
     before = prediction_error(base, held)
     report = FitReport(
@@ -155,7 +156,9 @@ def _check_prediction(base, data):
     with torch.no_grad():
         lost = (~base(data.state, data.action).isfinite()).any(-1).nonzero()
     if len(lost):
-        raise InputError(f"transitions: row {int(lost[0]) + 1}: {data.system}'s model can't go on from this state; remove it")
+        raise InputError(
+            f"transitions: row {int(lost[0]) + 1}: {data.system}'s model can't go on from this state; remove it"
+        )
 
 
 def _warnings(held, before, after):
@@ -169,7 +172,9 @@ def _warnings(held, before, after):
         rows = [i for i, name in enumerate(held.state_names) if name in GROUPS[group]]
         moved = float((held.next_state - held.state)[:, rows].square().sum(-1).mean().sqrt())
         if after[group] > moved + 1e-5:
-            found.append(f"held-out {group} is predicted worse than if nothing changed: wrong units, columns or period?")
+            found.append(
+                f"held-out {group} is predicted worse than if nothing changed: wrong units, columns or period?"
+            )
     return tuple(found)
 
 
@@ -177,7 +182,7 @@ def _warnings(held, before, after):
 
 
 def _fit_acceleration(residual, data, train, held, settings, generator):
-    """Linear part and network on `train`, judged on `held`; then the linear part of what needs no network on all data."""
+    """Linear part and network on `train`, judged on `held`; then on all data the linear part where no network is."""
     network, residual.network = residual.network, None
     _fit_linear(residual, train)
     misled = _misled(residual, held)
@@ -196,8 +201,9 @@ def _fit_acceleration(residual, data, train, held, settings, generator):
         residual.network = network
     else:
         residual.drop_network()
-    residual.drop_speed()
-    return _choice(residual, fit, stays), after
+    choice = _choice(residual, fit, stays)
+    residual.simplify()
+    return choice, after
 
 
 def _misled(residual, held):
@@ -258,10 +264,11 @@ def _fit_linear(residual, data, rounds=8):
 
 
 def _libraries(residual):
-    """Masks over the constant and the features: those that aren't multiplied by the speed, and all."""
-    names = ("1", *residual.feature_names())
-    plain = torch.tensor([not name.startswith(SPEED_PREFIX) for name in names])
-    return (plain, torch.ones_like(plain)) if not plain.all() else (plain,)
+    """Masks over the constant and the features: without products, with those of the speed, and all."""
+    inputs, factors = len(residual.system.residual_input_names), residual.config.factors
+    block = [0] * inputs + [place for place in range(1, 1 + len(factors)) for _ in range(inputs)]
+    block = torch.tensor([0, *block, *(0 for _ in residual.config.context_names)])
+    return tuple(block <= last for last in sorted({0, min(1, len(factors)), len(factors)}))
 
 
 def _rounding(system, data):

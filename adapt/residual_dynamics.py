@@ -10,6 +10,7 @@ import json
 import math
 from abc import ABC, abstractmethod
 from dataclasses import asdict, dataclass, fields, replace
+from itertools import islice
 
 import torch
 from torch import nn
@@ -20,7 +21,9 @@ from envs.dynamics import TORCH, Dynamics, casadi_backend
 from envs.errors import InputError
 
 FORMAT = "apg-adapt residual 1"
-SPEED_PREFIX = "speed * "  # of the names of features that are multiplied by the speed
+SPEED = "speed"  # name of the factor
+TERMS = 40  # [-] weights up to which terms are cheaper than a matrix
+NOTHING = ((0.0, ()),)  # the terms of an output that nothing is added to
 SMALL = 1e-12  # [m^2/s^2] keeps the gradient of the speed finite at rest
 
 
@@ -67,7 +70,7 @@ class ResidualConfig:
     kind: str = "acceleration"
     hidden: int = 64  # width of the network; 0 is none
     context_names: tuple[str, ...] = ()  # inputs that are neither state nor action, such as the battery voltage
-    speed: bool = True  # whether the linear part also sees its inputs times the speed; without, it is cheaper
+    factors: tuple[str, ...] = (SPEED,)  # the linear part also sees its inputs times each: the speed, or a context
 
 
 class ResidualDynamics(nn.Module, ABC):
@@ -131,6 +134,9 @@ class ResidualDynamics(nn.Module, ABC):
     def casadi(self):
         """The same step as a `casadi.Function` (state, action) -> next_state; a network stays in matrices (MX)."""
 
+    def simplify(self):
+        """Make a step as cheap as the fitted weights allow; later changes of them need not count."""
+
     def drop_network(self):
         """Remove a network that adds nothing: the residual is cheaper without."""
         self.network = None
@@ -178,8 +184,8 @@ class ResidualDynamics(nn.Module, ABC):
 class AccelerationResidual(ResidualDynamics):
     """A learned acceleration: linear in the translation-invariant inputs of the system, plus a network.
 
-    The linear part also sees each input times the speed, because what air does grows with its square: a parasitic drag
-    is linear in speed times velocity.
+    The linear part also sees each input times the speed, because what air does grows with its square (a parasitic drag
+    is linear in speed times velocity), and times each context, because that may change how the robot answers.
 
     The linear part acts inside the integrator, at each of its stages, as a disturbance does. So a drag or a payload is
     recovered exactly; a push held over the control period would have to learn how the velocity changes in it. The
@@ -187,46 +193,69 @@ class AccelerationResidual(ResidualDynamics):
     """
 
     def _build(self, generator):
-        outputs, inputs = len(self.system.accelerations), len(input_names(self.system))
+        outputs, inputs = len(self.system.accelerations), len(self.system.residual_input_names)
         contexts = len(self.config.context_names)
-        features = inputs * (1 + self.config.speed) + contexts
+        features = inputs * (1 + len(self.config.factors)) + contexts
         self.register_buffer("weights", torch.zeros(outputs, features, dtype=torch.float64))
         self.register_buffer("bias", torch.zeros(outputs, dtype=torch.float64))
+        self.terms = None
         if self.config.hidden:
             self.network = Correction(inputs + contexts, outputs, self.config.hidden, generator)
 
     def feature_names(self):
         """What each column of `weights` is multiplied with."""
-        names = input_names(self.system)
-        faster = tuple(SPEED_PREFIX + name for name in names) if self.config.speed else ()
-        return (*names, *faster, *self.config.context_names)
+        names = self.system.residual_input_names
+        products = tuple(f"{factor} * {name}" for factor in self.config.factors for name in names)
+        return (*names, *products, *self.config.context_names)
 
     def inputs(self, state, action):
         """What the network sees (..., p): `residual_inputs` of the system, then the context."""
         x, u = self._scalars(state, action)
-        return torch.cat((TORCH.pack(self.system.residual_inputs(x, u)), self._context_for(state)), -1)
+        return torch.cat((TORCH.pack(tuple(self.system.residual_inputs(x, u))), self._context_for(state)), -1)
 
     def features(self, state, action):
-        """What the linear part sees (..., f)."""
-        return torch.cat((self._own_features(*self._scalars(state, action), TORCH), self._context_for(state)), -1)
+        """What the linear part sees (..., f), in the order of `feature_names`."""
+        return TORCH.pack(self._features(*self._scalars(state, action), self._context_for(state).unbind(-1)))
 
     def _scalars(self, state, action):
         return self.system.State(*state.unbind(-1)), self.system.Action(*action.unbind(-1))
 
-    def _own_features(self, x, u, backend):
-        """Those that come from state and action."""
-        inputs = tuple(self.system.residual_inputs(x, u))
-        if not self.config.speed:
-            return backend.pack(inputs)
-        speed = (sum(v * v for v in self.system.velocity(x)) + SMALL).sqrt()
-        return backend.pack((*inputs, *(speed * value for value in inputs)))
+    def _features(self, x, u, context, used=None):
+        """The same as a list of scalars; what none of the columns `used` needs is not computed (None)."""
+        count = len(self.system.residual_input_names)
+        needed = count if used is None else max((c % count + 1 for c in used if c < self._context_column()), default=0)
+        inputs = list(islice(self.system.residual_inputs(x, u), needed)) + [None] * (count - needed)
+        values = dict(zip(self.config.context_names, context, strict=True))
+        if SPEED in self.config.factors:
+            values[SPEED] = (sum(v * v for v in self.system.velocity(x)) + SMALL).sqrt()
+        pairs = [(values[factor], value) for factor in self.config.factors for value in inputs]
+        wanted = enumerate(pairs, len(inputs))
+        products = [a * b if used is None or column in used else None for column, (a, b) in wanted]
+        return [*inputs, *products, *context]
 
-    def drop_speed(self):
-        """Leave out what no output uses."""
-        inputs = len(input_names(self.system))
-        if self.config.speed and not self.weights[:, inputs : 2 * inputs].any():
-            self.weights = torch.cat((self.weights[:, :inputs], self.weights[:, 2 * inputs :]), -1)
-            self.config = replace(self.config, speed=False)
+    def _context_column(self):
+        """The first column of the features that is a context."""
+        return len(self.system.residual_input_names) * (1 + len(self.config.factors))
+
+    def simplify(self):
+        """Make a step as cheap as the fitted weights allow; later changes of them don't count.
+
+        Factors that no output uses are left out. Few weights become terms of the equations instead of a matrix.
+        """
+        self._drop_factors()
+        table = self.weights.tolist()
+        if sum(value != 0 for row in table for value in row) <= TERMS:
+            rows = (tuple((column, value) for column, value in enumerate(row) if value) for row in table)
+            self.terms = tuple(zip(self.bias.tolist(), rows, strict=True))
+
+    def _drop_factors(self):
+        inputs = len(self.system.residual_input_names)
+        blocks = self.weights[:, inputs : inputs * (1 + len(self.config.factors))].unflatten(-1, (-1, inputs))
+        used = blocks.abs().sum((0, 2)) > 0
+        rest = self.weights[:, inputs * (1 + len(self.config.factors)) :]
+        self.weights = torch.cat((self.weights[:, :inputs], blocks[:, used].flatten(1), rest), -1)
+        factors = tuple(name for name, on in zip(self.config.factors, used.tolist(), strict=True) if on)
+        self.config = replace(self.config, factors=factors)
 
     def corrected(self, state, action):
         if self.network is None:
@@ -242,29 +271,34 @@ class AccelerationResidual(ResidualDynamics):
 
     def _with_linear(self, context):
         """The base with the linear part as one more disturbance; context (..., c) is constant in a step."""
-        weights, bias = self.weights.to(context.dtype), self.bias.to(context.dtype)
-        width = weights.shape[-1] - context.shape[-1]
-        own, offset = weights[:, :width].T, bias + context @ weights[:, width:].T
+        if self.terms is not None:
+            return self._with(lambda x, u: self._sum_of_terms(x, u, context.unbind(-1)))
+        weights, bias, context = self.weights.to(context.dtype), self.bias.to(context.dtype), context.unbind(-1)
+        return self._with(lambda x, u: (TORCH.pack(self._features(x, u, context)) @ weights.T + bias).unbind(-1))
+
+    def _with(self, force):
+        """The base with `force`, a function of x and u, as one more disturbance."""
+        if self.terms == NOTHING * len(self.system.accelerations):
+            return self.base
 
         def learned(system, x, u):
-            force = self._own_features(x, u, TORCH) @ own + offset
-            return system.residual_rates(x, force.unbind(-1))
+            rates = system.residual_rates(x, force(x, u))
+            return {name: rate for name, rate in rates.items() if not isinstance(rate, float) or rate}
 
         return replace(self.base, disturbances=(*self.base.disturbances, learned))
+
+    def _sum_of_terms(self, x, u, context):
+        features = self._features(x, u, context, {column for _, row in self.terms for column, _ in row})
+        return [sum((value * features[column] for column, value in row), bias) for bias, row in self.terms]
 
     def casadi(self):
         import casadi
 
-        context, backend = self._casadi_context(), casadi_backend()
+        context, backend = casadi.vertsplit(self._casadi_context()), casadi_backend()
         weights, bias = casadi.DM(self.weights.tolist()), casadi.DM(self.bias.tolist())
-
-        def learned(system, x, u):
-            force = weights @ casadi.vertcat(self._own_features(x, u, backend), context) + bias
-            return system.residual_rates(x, casadi.vertsplit(force))
-
+        base = self._with(lambda x, u: casadi.vertsplit(weights @ backend.pack(self._features(x, u, context)) + bias))
         (state, action), push = self._symbols(casadi.SX), casadi.SX.sym("push", len(self.bias))
         x, u = self.system.State(*casadi.vertsplit(state)), self.system.Action(*casadi.vertsplit(action))
-        base = replace(self.base, disturbances=(*self.base.disturbances, learned))
         rates = None if self.network is None else self.system.residual_rates(x, casadi.vertsplit(push))
         following = base.advance(state, action, rates, backend)
         if self.network is None:
@@ -272,7 +306,7 @@ class AccelerationResidual(ResidualDynamics):
         step = casadi.Function("pushed", [state, action, push], [following])
         inputs = casadi.Function("inputs", [state, action], [casadi.vertcat(*self.system.residual_inputs(x, u))])
         state, action = self._symbols(casadi.MX)
-        seen = casadi.vertcat(inputs(state, action), context)
+        seen = casadi.vertcat(inputs(state, action), *context)
         return _casadi_step(state, action, step(state, action, self.network.casadi(seen)))
 
 
@@ -323,18 +357,6 @@ def make_residual(base, config=ResidualConfig(), generator=None):
     return RESIDUALS[config.kind](base, config, generator)
 
 
-def input_names(system):
-    """A name for each of `residual_inputs`; the system's own `residual_input_names` where it gives some."""
-    count = len(system.residual_inputs(*_example(system)))
-    return tuple(getattr(system, "residual_input_names", ())) or tuple(f"input {i + 1}" for i in range(count))
-
-
-def _example(system):
-    """A state and an action of scalars."""
-    states, actions = len(system.State._fields), len(system.Action._fields)
-    return system.State(*torch.ones(states).unbind()), system.Action(*torch.zeros(actions).unbind())
-
-
 def load_residual(path, base=None):
     """Read what `ResidualDynamics.save` wrote.
 
@@ -347,9 +369,12 @@ def load_residual(path, base=None):
     try:
         tensors, said = read_safetensors(path, FORMAT, "residual")
     except OSError as error:
-        raise InputError(f"{path}: can't read a residual ({error.strerror or error}); name a file that exists") from error
+        raise InputError(
+            f"{path}: can't read a residual ({error.strerror or error}); name a file that exists"
+        ) from error
     try:
-        config = ResidualConfig(**{**said["config"], "context_names": tuple(said["config"]["context_names"])})
+        names = {name: tuple(said["config"][name]) for name in ("context_names", "factors")}
+        config = ResidualConfig(**{**said["config"], **names})
         parameters = {k: tuple(v) if isinstance(v, list) else v for k, v in said["parameters"].items()}
         written = Dynamics(replace(make_system(said["system"]), **parameters), **said["dynamics"])
     except (KeyError, TypeError, AttributeError) as error:
@@ -361,6 +386,7 @@ def load_residual(path, base=None):
         residual.load_state_dict(tensors)
     except RuntimeError as error:
         raise InputError(f"{path}: its tensors don't fit its description; write it again") from error
+    residual.simplify()
     return residual
 
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import torch
 
 PENALTIES = (1e-9, 1e-4, 1e-2, 1e-1)  # [-] of inputs and outputs scaled to mean square one
-MARGIN = 1.02  # [-] a smaller support is taken when its error is at most this much larger than the best one
 NEGLIGIBLE = 1e-4  # [-] share of the signal below which a difference of errors doesn't matter
 ROWS = 5  # rows that each input of a support must have: neighbouring rows are nearly copies
 LARGEST = 12  # [-] inputs in a support
@@ -50,12 +49,14 @@ def fit_sparse(inputs, outputs, folds, tolerance, libraries):
         tolerance: (k) errors below it are rounding and count as none.
         libraries: masks (p) of the inputs to choose among, such as simple ones only, and all.
     """
-    largest = min(inputs.shape[1], LARGEST, max(2, len(inputs) // ROWS))
+    distinct = len(inputs.unique(dim=0))  # a row that is repeated says nothing new
+    largest = min(inputs.shape[1], LARGEST, max(1, distinct // ROWS))
     scale = _scale(inputs)
     size = torch.maximum(outputs.square().mean(0).sqrt(), tolerance)
     scaled, wanted = inputs / scale, outputs / size
     errors = _path_errors(scaled, wanted, folds, largest, libraries)
-    places, penalties = _simplest(errors, tolerance / size, largest)
+    doubt = (ROWS / (2 * len(inputs))) ** 0.5  # relative standard error of a root mean square of N / ROWS numbers
+    places, penalties = _simplest(errors, 1 + doubt, tolerance / size, largest)
     gram, moment = _moments(scaled, wanted)
     every = torch.arange(outputs.shape[1])
     support = _paths(gram[None], moment[None], largest, libraries)[0, every, places]
@@ -162,16 +163,16 @@ def _backward(gram, moment, support, largest):
     return torch.stack(path, 2)
 
 
-def _simplest(errors, tolerance, largest):
+def _simplest(errors, margin, tolerance, largest):
     """Place on the path and of the penalty (k), (k): the smallest support near the best, then the largest penalty.
 
-    Of two supports of one size the one of the smaller error counts.
+    Near is an error at most `margin` times the smallest. Of two supports of one size the better one counts.
     """
     outputs, places, _ = errors.shape
     sizes = torch.cat((torch.arange(largest + 1), torch.arange(largest, -1, -1)))
     sizes = sizes.repeat(places // len(sizes))
     best = errors.min(-1).values  # (k, S)
-    limit = best.min(-1).values * MARGIN + NEGLIGIBLE + tolerance
+    limit = best.min(-1).values * margin + NEGLIGIBLE + tolerance
     good = best <= limit[:, None]
     rank = torch.where(good, sizes.double() + best / (best.max() + 1), torch.inf)
     place = rank.argmin(-1)

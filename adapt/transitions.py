@@ -56,7 +56,9 @@ class Transitions:
         for name, (tensor, names) in wanted.items():
             shape = None if tensor is None else tuple(tensor.shape)
             if shape != (rows, len(names)):
-                raise InputError(f"transitions: {name} is {shape}, expected {(rows, len(names))} for {', '.join(names)}")
+                raise InputError(
+                    f"transitions: {name} is {shape}, expected {(rows, len(names))} for {', '.join(names)}"
+                )
 
     def __len__(self):
         return len(self.trajectory)
@@ -120,7 +122,9 @@ class Transitions:
         try:
             transitions = read(cls, path, system)
         except OSError as error:
-            raise InputError(f"{path}: can't read transitions ({error.strerror or error}); name a file that exists") from error
+            raise InputError(
+                f"{path}: can't read transitions ({error.strerror or error}); name a file that exists"
+            ) from error
         check(transitions, system, minimum, str(path))
         return transitions
 
@@ -156,7 +160,8 @@ def _check_system(transitions, system, source):
             raise InputError(f"{source}: {kind} are {', '.join(names)}; expected {', '.join(expected)}")
     if not math.isclose(transitions.dt, system.dt, rel_tol=DT_TOLERANCE):
         raise InputError(
-            f"{source}: control period is {transitions.dt:g} s, expected {system.dt:g} s; resample, or set dt of the system"
+            f"{source}: control period is {transitions.dt:g} s, expected {system.dt:g} s; "
+            "resample, or set dt of the system"
         )
 
 
@@ -209,7 +214,9 @@ def collect(policy, env, n, exploration=0.0, generator=None):
         flown = _fly(policy, env, queue[:count], min(missing, env.task.steps), exploration, generator)
         queue = queue[count:]
         if not any(len(state) for state, _, _ in flown):
-            raise InputError("collect: every flight failed at once; the policy or the target gives numbers that aren't finite")
+            raise InputError(
+                "collect: every flight failed at once; the policy or the target gives numbers that aren't finite"
+            )
         for flight in flown:
             flights.append(tuple(part[:missing] for part in flight))
             missing -= len(flights[-1][0])
@@ -405,7 +412,9 @@ def _write_safetensors(transitions, path):
 
     names = ("state", "action", "next_state", "trajectory", "context")
     tensors = {name: getattr(transitions, name) for name in names if getattr(transitions, name) is not None}
-    said = {name: getattr(transitions, name) for name in ("dt", "system", "state_names", "action_names", "context_names")}
+    said = {
+        name: getattr(transitions, name) for name in ("dt", "system", "state_names", "action_names", "context_names")
+    }
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     save_file(tensors, path, {"format": FORMAT, "transitions": json.dumps(said)})
 

@@ -68,6 +68,12 @@ class FixedWing(System):
     State: ClassVar[type] = State
     Action: ClassVar[type] = Action
     accelerations: ClassVar[tuple[str, ...]] = ("u_b", "v_b", "w_b", "p", "q", "r")
+    residual_input_names: ClassVar[tuple[str, ...]] = (
+        *("u_b - cruise", "v_b", "w_b"),
+        *("down in body x", "down in body y", "down in body z"),
+        *("p", "q", "r", *Action._fields),
+        *(f"{axis} in body {own}" for axis in ("north", "east") for own in "xyz"),
+    )
     bounds: ClassVar[dict[str, tuple[float, float]]] = {
         **dict.fromkeys(("dt", "mass", "inertia_x", "inertia_y", "inertia_z", "thrust_max"), (0.0, math.inf)),
         **dict.fromkeys(("elevator_limit", "aileron_limit", "rudder_limit", "incidence_limit"), (0.0, math.pi / 2)),
@@ -172,9 +178,13 @@ class FixedWing(System):
         return dict(zip(("u_b", "v_b", "w_b"), rigid_body.to_body(attitude(x), acceleration), strict=True))
 
     def residual_inputs(self, x, u):
-        """Body velocity relative to a cruise of 11.5 m/s, direction of gravity in body axes, body rates, action."""
-        down = rigid_body.axis_z(rigid_body.inverse(attitude(x)))
-        return (x.u_b - CRUISE, x.v_b, x.w_b, *down, x.p, x.q, x.r, *u)
+        """Body velocity relative to a cruise of 11.5 m/s, world axes in body axes, body rates, action."""
+        back = rigid_body.inverse(attitude(x))
+        yield from (x.u_b - CRUISE, x.v_b, x.w_b)
+        yield from rigid_body.axis_z(back)
+        yield from (x.p, x.q, x.r, *u)
+        yield from rigid_body.axis_x(back)
+        yield from rigid_body.axis_y(back)
 
     def place(self, x):
         """North, west, up."""

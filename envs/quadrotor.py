@@ -65,6 +65,12 @@ class Quadrotor(System):
     State: ClassVar[type] = State
     Action: ClassVar[type] = Action
     accelerations: ClassVar[tuple[str, ...]] = ("vx", "vy", "vz", "p", "q", "r")
+    residual_input_names: ClassVar[tuple[str, ...]] = (
+        *("forward velocity", "left velocity", "up velocity"),
+        *("up in body x", "up in body y", "up in body z"),
+        *("p", "q", "r", *Action._fields),
+        *(f"{axis} in body {own}" for axis in ("world x", "world y") for own in "xyz"),
+    )
     bounds: ClassVar[dict[str, tuple[float, float]]] = {
         **dict.fromkeys(
             ("dt", "mass", "inertia_x", "inertia_y", "inertia_z", "rate_gain_x", "rate_gain_y", "rate_gain_z")
@@ -164,10 +170,16 @@ class Quadrotor(System):
         return dict(zip(("vx", "vy", "vz"), acceleration, strict=True))
 
     def residual_inputs(self, x, u):
-        """Body velocity, direction of gravity in body axes, body rates, action: blind to position and heading."""
-        velocity = rigid_body.to_body(attitude(x), (x.vx, x.vy, x.vz))
-        upward = rigid_body.axis_z(rigid_body.inverse(attitude(x)))
-        return (*velocity, *upward, x.p, x.q, x.r, *u)
+        """Body velocity, world axes in body axes, body rates, action: blind to position.
+
+        Up tells the tilt. The other two tell the heading, without which a wind has no direction.
+        """
+        back = rigid_body.inverse(attitude(x))
+        yield from rigid_body.to_world(back, (x.vx, x.vy, x.vz))
+        yield from rigid_body.axis_z(back)
+        yield from (x.p, x.q, x.r, *u)
+        yield from rigid_body.axis_x(back)
+        yield from rigid_body.axis_y(back)
 
     def residual_rates(self, x, residual):
         """Acceleration in body axes [m/s^2] and angular acceleration [rad/s^2]."""

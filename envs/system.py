@@ -35,6 +35,7 @@ class System(ABC):
     State: ClassVar[type]  # NamedTuple of the state's scalars; its field order is the order of every state tensor
     Action: ClassVar[type]  # NamedTuple of the action's scalars, each in [-1, 1]
     accelerations: ClassVar[tuple[str, ...]]  # state rows that a force or torque acts on
+    residual_input_names: ClassVar[tuple[str, ...]]  # of `residual_inputs`
     bounds: ClassVar[dict[str, tuple[float, float]]] = {}  # open interval of each checked parameter
     groups: ClassVar[dict[str, tuple[str, ...]]] = {}  # one name for several fields that are scaled together
     axes: ClassVar[dict[str, Axis]] = {}  # how states are shown; those without one go by their name
@@ -65,7 +66,11 @@ class System(ABC):
 
     @abstractmethod
     def residual_inputs(self, x, u):
-        """What an unmodelled force may depend on: a tuple of scalars of order one, invariant to translation."""
+        """What an unmodelled force may depend on: scalars of order one, invariant to translation.
+
+        An iterable in the order of `residual_input_names`, cheap and likely ones first: a residual that needs only the
+        first few reads no further.
+        """
 
     def residual_rates(self, x, residual):
         """What a residual, one scalar for each of `accelerations`, adds to the derivative: {state name: rate}."""
@@ -80,13 +85,13 @@ class System(ABC):
         return self
 
     def place(self, x):
-        """Where the robot is seen, (x, y, z) with z up [m]: the point whose trail is drawn."""
+        """Where a state of floats is seen, (x, y, z) with z up [m]: the point whose trail is drawn."""
         return tuple(getattr(x, name, 0 * x[0]) for name in ("px", "py", "pz"))
 
     def outline(self, x, size):
-        """Lines to draw the robot by, each a list of points (x, y, z), z up [m]; `size` [m] is how large it may appear.
+        """Lines to draw a state of floats by, each a list of points (x, y, z) with z up [m]; closed ones are filled.
 
-        A robot that is as large as what it moves in ignores `size`.
+        `size` [m] is about the radius that the robot should appear with, where its own is too small to be seen.
         """
         return []
 

@@ -67,7 +67,7 @@ def test_nothing_depends_on_where_the_robot_is(robot, draw, scalars):
     dynamics = make_dynamics(robot, "drag=0.3 push=1")
     difference = dynamics(moved, action) - dynamics(state, action)
     torch.testing.assert_close(difference, moved - state)
-    here, there = (robot.residual_inputs(*scalars(robot, s, action)) for s in (state, moved))
+    here, there = (tuple(robot.residual_inputs(*scalars(robot, s, action))) for s in (state, moved))
     torch.testing.assert_close(torch.stack(here), torch.stack(there))
 
 
