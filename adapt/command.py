@@ -4,6 +4,7 @@ import contextlib
 import errno
 import io
 import json
+import math
 import os
 import re
 import signal
@@ -14,6 +15,7 @@ from pathlib import Path
 from envs.errors import InputError
 
 USAGE, INTERRUPTED = 2, 130  # exit statuses
+FULL_OR_FORBIDDEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EROFS, errno.EPERM)
 
 
 def run(name, options, main):
@@ -30,7 +32,7 @@ def run(name, options, main):
     except KeyboardInterrupt as interrupt:
         sys.exit(_fail(prefix, f"interrupted; {interrupt}" if str(interrupt) else "interrupted", INTERRUPTED))
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EPERM):
+        if error.errno not in FULL_OR_FORBIDDEN:
             raise
         sys.exit(_fail(prefix, f"{error.filename or 'output'}: {error.strerror}; nothing half-written is kept", USAGE))
 
@@ -88,9 +90,17 @@ def whole(path):
 
 
 def write_json(path, content):
-    """Write JSON that people can read."""
+    """Write JSON that people can read; a number that isn't finite becomes null, which JSON has a word for."""
     with whole(path) as partial:
-        partial.write_text(json.dumps(content, indent=2) + "\n")
+        partial.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+
+
+def _finite(content):
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def pick_robot(name, vehicle):

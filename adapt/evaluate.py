@@ -67,7 +67,11 @@ def main(options):
     print(f"time per action: median {spent['median_ms']:.3f} ms, 99th percentile {spent['p99_ms']:.3f} ms, one thread")
     if out:
         content = {"options": asdict(options), "metric": task.metric, "unit": task.unit, **result.summary, **spent}
-        content |= {"table": result.table.to_dict("list"), **command.environment(options.seed, options.threads)}
+        content |= {
+            "policy_info": policy.info,
+            "table": result.table.to_dict("list"),
+            **command.environment(options.seed, options.threads),
+        }
         command.write_json(out, content)
         print(f"results in {out}")
 

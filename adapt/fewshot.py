@@ -241,7 +241,8 @@ def _recorded_only(options):
 
 def _target_text(options):
     if _recorded_only(options):
-        return " ".join(Path(path).name for path in options.log or (options.transitions,))
+        first, *more = options.log or (options.transitions,)
+        return Path(first).name + (f" and {len(more)} more" if more else "")
     return " ".join(options.target or DEFAULT_TARGET)
 
 
@@ -249,7 +250,7 @@ def _table(metrics):
     from tabulate import tabulate
 
     rows = [
-        (text, f"{m['mean']:.4f} ± {m['std']:.4f}", f"{m['success']:.2f}", m["n"])
+        (text, f"{m['mean']:.4f} ± {m['std']:.4f}" if m["success"] else "none succeeded", f"{m['success']:.2f}", m["n"])
         for name, text in NAMES.items()
         if (m := metrics.get(name))
     ]

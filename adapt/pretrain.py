@@ -231,10 +231,14 @@ def _score(row):
 
 
 def _save_training(run, folder, identity):
+    import io
+
     import torch
 
+    content = io.BytesIO()  # written by Python, whose errors name the file and the reason; torch's don't
+    torch.save({**run.state_dict(), "identity": identity}, content)
     with command.whole(folder / "training.pt") as partial:
-        torch.save({**run.state_dict(), "identity": identity}, partial)
+        partial.write_bytes(content.getvalue())
 
 
 class Log:

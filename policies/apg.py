@@ -14,7 +14,6 @@ import torch
 from envs.errors import InputError
 from policies.networks import network_for
 
-
 OPTIMIZERS = {
     "adam": lambda parameters: torch.optim.Adam(parameters),
     "sgd": lambda parameters: torch.optim.SGD(parameters, momentum=0.9),
@@ -198,7 +197,7 @@ def train(run, dynamics, task, banks, config):
 
     Args:
         run: `Training`, changed in place.
-        dynamics: what the gradient flows through and what data are collected in.
+        dynamics: what the gradient flows through; data are collected in those that the run was begun with.
         banks: training episodes of each speed of the curriculum, slowest first.
     """
     parameters = list(run.network.parameters())

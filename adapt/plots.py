@@ -1,0 +1,375 @@
+"""Pictures of an adaptation: the flight before and after, error over time, residual against truth, training.
+
+Each is drawn on a `Figure` of its own, without pyplot, so that nothing is shared and no window is opened. They are made
+to be read at half the width of a page: large type, thick lines, colours that colour-blind people tell apart (Okabe and
+Ito 2008), and a sequential map (plasma, without its pale end) for the error along a path.
+"""
+
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import torch
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+
+from adapt.command import whole
+from adapt.residual import GROUPS, predict
+from envs.system import Axis
+
+DPI = 150
+GREY, LIGHT = "#595959", "#BDBDBD"
+COLOURS = {"source": GREY, "zero_shot": "#D55E00", "few_shot": "#0072B2", "oracle": "#009E73"}
+NAMES = {"source": "source", "zero_shot": "zero-shot", "few_shot": "few-shot", "oracle": "oracle"}
+STYLE = {
+    "font.size": 13,
+    "axes.titlesize": 14,
+    "axes.labelsize": 13,
+    "figure.titlesize": 15,
+    "legend.fontsize": 12,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": GREY,
+    "axes.linewidth": 1.2,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E6E6E6",
+    "grid.linewidth": 1.0,
+    "lines.linewidth": 2.8,
+    "lines.solid_capstyle": "round",
+    "legend.frameon": False,
+    "figure.facecolor": "white",
+}
+ERROR_MAP = LinearSegmentedColormap.from_list("error", matplotlib.colormaps["plasma"](np.linspace(0.0, 0.82, 256)))
+PANEL = 2.7  # [inch] width of one picture of a flight
+
+
+def draw_all(adaptation, folder):
+    """Draw every picture into a folder; a file is there whole or not at all.
+
+    Returns:
+        the paths of the PNG files.
+    """
+    paths = []
+    for name, draw in PICTURES.items():
+        with matplotlib.rc_context(STYLE):
+            figure = draw(adaptation)
+            with whole(Path(folder) / f"{name}.png") as partial:
+                figure.savefig(partial, format="png", dpi=DPI)
+        paths.append(Path(folder) / f"{name}.png")
+    return paths
+
+
+# --- what is shown ----------------------------------------------------------------------------------------------------
+
+
+def representative(adaptation):
+    """The test episode with the median error before the adaptation."""
+    errors = adaptation.evaluations["zero_shot"].table.error.to_numpy(dtype=float)
+    order = np.argsort(np.where(np.isfinite(errors), errors, np.inf), kind="stable")
+    return int(order[len(order) // 2])
+
+
+def last_steps(task, evaluation):
+    """The step (N,) at which each episode ended; states behind it repeat the last one."""
+    episodes, states = evaluation.episodes, evaluation.states
+    ended = torch.full((len(episodes),), task.steps, device=states.device)
+    for t in reversed(range(1, task.steps + 1)):
+        step = torch.full_like(ended, t)
+        over = task.arrived(episodes, step, states[:, t]) | task.diverged(episodes, step, states[:, t])
+        ended = torch.where(over, step, ended)
+    return ended.cpu().numpy()
+
+
+def traces(task, evaluation):
+    """The error (N, steps + 1) over time, NaN behind the end of an episode and where the state isn't finite."""
+    with torch.no_grad():
+        trace = task.trace(evaluation.episodes, evaluation.states).cpu().double().numpy()
+    after = np.arange(trace.shape[1]) > last_steps(task, evaluation)[:, None]
+    return np.where(after | ~np.isfinite(trace), np.nan, trace)
+
+
+def small(values, unit):
+    """Factor and unit in which lengths or speeds are easy to read: centimetres where all are below one metre."""
+    finite = np.abs(np.asarray(values, dtype=float))
+    finite = finite[np.isfinite(finite)]
+    if unit.split("/")[0] == "m" and len(finite) and finite.max() < 1:
+        return 100.0, "c" + unit
+    return 1.0, unit
+
+
+def score(evaluation, scale):
+    """The mean metric of an evaluation in words, and how many flights failed if any did."""
+    factor, unit = scale
+    summary = evaluation.summary
+    mean, flights = summary["mean"], summary["n"]
+    failed = round((1 - summary["success"]) * flights)
+    if failed == flights:
+        return f"all {flights} flights fail"
+    return f"{number(factor * mean)} {unit}" + (f", {failed} of {flights} fail" if failed else "")
+
+
+def score_scale(adaptation):
+    """The scale in which all scores are told."""
+    means = [evaluation.summary["mean"] for evaluation in adaptation.evaluations.values()]
+    return small(means, adaptation.evaluations["zero_shot"].unit)
+
+
+def number(value):
+    """Two significant digits, without an exponent."""
+    if not np.isfinite(value):
+        return "–"
+    if value and abs(value) < 1e-3:
+        return "< 0.001"
+    digits = 1 - int(np.floor(np.log10(abs(value) or 1.0)))
+    return f"{value:.{min(max(digits, 0), 3)}f}"
+
+
+def axis_of(system, name):
+    """How a state, or the time "t", is shown."""
+    return Axis("time", "s") if name == "t" else system.axes.get(name, Axis(name, ""))
+
+
+def label(axis, power=""):
+    """An axis label with its unit."""
+    return f"{axis.label} [{axis.unit}{power}]" if axis.unit else axis.label
+
+
+def views_of(task):
+    """Pairs of states to draw flights in; a task that names none gets its first two reference entries over time."""
+    return task.views or tuple(("t", name) for name in task.reference_names[:2])
+
+
+# --- flight -----------------------------------------------------------------------------------------------------------
+
+
+def draw_flight(adaptation):
+    """One test episode before and after: the flown path, coloured by its error, on its reference."""
+    task, names = adaptation.policy.task, ("zero_shot", "few_shot")
+    row, views = representative(adaptation), views_of(task)
+    evaluations = [adaptation.evaluations[name] for name in names]
+    columns = [_columns(task, evaluation, row) for evaluation in evaluations]
+    errors = [traces(task, evaluation)[row] for evaluation in evaluations]
+    largest = float(np.nanquantile(np.concatenate(errors), 0.98))
+    factor, unit = small([largest], task.trace_unit)
+    norm = Normalize(0, max(factor * largest, 1e-9))
+    proportions = [_proportion(task.system, columns, view) for view in views]
+    heights = [PANEL * (0.55 if proportion is None else max(proportion, 0.65)) for proportion in proportions]
+    figure = Figure(figsize=(7.2, 0.9 + 0.6 * len(views) + sum(heights)), layout="constrained")
+    grid = figure.subplots(len(views), 2, sharex="row", sharey="row", height_ratios=heights, squeeze=False)
+    for i, (view, proportion) in enumerate(zip(views, proportions, strict=True)):
+        for axes, shown, error in zip(grid[i], columns, errors, strict=True):
+            lines = _draw_view(axes, task.system, shown, view, factor * error, norm)
+            axes.set_aspect("auto" if proportion is None else "equal")
+            axes.set_xlabel(label(axis_of(task.system, view[0])))
+        grid[i, 0].set_ylabel(label(axis_of(task.system, view[1])))
+    for axes, name, evaluation in zip(grid[0], names, evaluations, strict=True):
+        title = f"{NAMES[name]}: {score(evaluation, score_scale(adaptation))}"
+        axes.set_title(title, color=COLOURS[name], fontweight="bold")
+    bar = figure.colorbar(lines, ax=grid, aspect=30, pad=0.02, extend="max", ticks=MaxNLocator(5))
+    bar.set_label(f"{task.trace_name} [{unit}]")
+    bar.outline.set_visible(False)
+    grid[0, 0].legend(loc="best", handlelength=1.5)
+    figure.suptitle(f"{evaluations[0].metric} of {evaluations[0].summary['n']} test flights", color=GREY)
+    return figure
+
+
+def _proportion(system, columns, view):
+    """Height over width of a picture in space, or None where both directions can't have one scale."""
+    axes = [axis_of(system, name) for name in view]
+    if axes[0].unit != axes[1].unit or "t" in view:
+        return None
+    values = [np.concatenate([part[name] for pair in columns for part in pair if name in part]) for name in view]
+    spans = [abs(axis.factor) * (np.nanmax(v) - np.nanmin(v)) for axis, v in zip(axes, values, strict=True)]
+    proportion = spans[1] / max(spans[0], 1e-9)
+    return proportion if 1 / 3 < proportion < 3 / 2 else None
+
+
+def _columns(task, evaluation, row):
+    """Reference and flown values by state name, and the time, of one episode up to its end."""
+    count = last_steps(task, evaluation)[row] + 1
+    with torch.no_grad():
+        path = task.path(evaluation.episodes[row : row + 1])[0].cpu().double().numpy()
+    flown = evaluation.states[row, :count].cpu().double().numpy()
+    reference = dict(zip(task.reference_names, path.T, strict=True))
+    states = dict(zip(task.system.State._fields, flown.T, strict=True))
+    time = task.system.dt * np.arange(len(path))
+    return {**reference, "t": time}, {**states, "t": time[:count]}
+
+
+def _draw_view(axes, system, columns, view, error, norm):
+    """Reference in grey, flown path in the colours of its error; returns the coloured lines."""
+    reference, flown = columns
+    factors = [axis_of(system, name).factor for name in view]
+    if all(name in reference for name in view):
+        wanted = [factor * reference[name] for factor, name in zip(factors, view, strict=True)]
+        axes.plot(*wanted, color=LIGHT, linewidth=7, zorder=1, label="reference")
+    path = np.stack([factor * flown[name] for factor, name in zip(factors, view, strict=True)], -1)
+    lines = LineCollection(np.stack((path[:-1], path[1:]), 1), cmap=ERROR_MAP, norm=norm, linewidth=3, zorder=3)
+    lines.set_array(error[1 : len(path)])
+    lines.set_capstyle("round")
+    axes.add_collection(lines)
+    axes.plot(*path[0], "o", color="black", markersize=8, zorder=4, label="start")
+    axes.autoscale_view()
+    axes.locator_params(nbins=5)
+    return lines
+
+
+# --- error ------------------------------------------------------------------------------------------------------------
+
+
+def draw_error(adaptation):
+    """Error over time: mean of all test flights, and the band that holds eight of ten."""
+    task, evaluations = adaptation.policy.task, adaptation.evaluations
+    found = {name: traces(task, evaluations[name]) for name in COLOURS if name in evaluations}
+    factor, unit = small([np.nanmean(trace[:, _flying(trace)], 0).max() for trace in found.values()], task.trace_unit)
+    figure = Figure(figsize=(7, 4.4), layout="constrained")
+    axes = figure.subplots()
+    for name, trace in found.items():
+        flying = _flying(trace)
+        time, error = task.system.dt * np.arange(trace.shape[1])[flying], factor * trace[:, flying]
+        style = "--" if name == "source" else "-"
+        said = f"{NAMES[name]}: {score(evaluations[name], score_scale(adaptation))}"
+        axes.plot(time, np.nanmean(error, 0), style, color=COLOURS[name], label=said)
+        low, high = np.nanquantile(error, (0.1, 0.9), axis=0)
+        axes.fill_between(time, low, high, color=COLOURS[name], alpha=0.15, linewidth=0)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel(f"{task.trace_name} [{unit}]")
+    axes.set_ylim(bottom=0)
+    axes.margins(x=0)
+    count = evaluations["zero_shot"].summary["n"]
+    axes.set_title(f"mean of {count} test flights, band: 10–90 %", loc="left", color=GREY)
+    axes.legend(loc="best", title=evaluations["zero_shot"].metric, alignment="left")
+    return figure
+
+
+def _flying(trace):
+    """Columns in which at least half of the episodes go on."""
+    return np.isfinite(trace).mean(0) >= 0.5
+
+
+# --- residual ---------------------------------------------------------------------------------------------------------
+
+
+def draw_residual(adaptation):
+    """What the model lacks in each transition, measured, against what the residual adds."""
+    system, transitions = adaptation.policy.task.system, adaptation.transitions
+    lack, added = lacks(adaptation)
+    rows = _rows(matters(system, transitions, lack, added))
+    width = max(len(names) for names in rows)
+    panel = min(max(2.2, 5.6 / width), 3.6)
+    figure = Figure(figsize=(0.7 + panel * width, 1.0 + (0.35 + panel) * len(rows)), layout="constrained")
+    grid = figure.subplots(len(rows), width, squeeze=False)
+    for axes in grid.flat:
+        axes.set_visible(False)
+    for names, row in zip(rows, grid, strict=True):
+        for axes, name in zip(row, names, strict=False):
+            place, axis = system.accelerations.index(name), axis_of(system, name)
+            axes.set_visible(True)
+            _draw_lack(axes, lack[:, place], added[:, place])
+            axes.set_title(axis.label)
+            axes.set_xlabel(f"[{axis.unit}²]" if axis.unit else "")
+    figure.supxlabel("acceleration that the model lacks")
+    figure.supylabel("residual adds")
+    figure.suptitle(_prediction(adaptation, [name for names in rows for name in names]))
+    return figure
+
+
+def _rows(names):
+    """Names in rows of at most three, as even as they go."""
+    width = 2 if len(names) == 4 else 3
+    return [names[i : i + width] for i in range(0, len(names), width)]
+
+
+def lacks(adaptation):
+    """Accelerations (N, k) that the model lacks by the transitions, and those that the residual adds.
+
+    Both are differences over one control period, divided by it, of the rows `accelerations` of the state.
+    """
+    residual, transitions = adaptation.residual, adaptation.transitions
+    rows = [transitions.state_names.index(name) for name in residual.system.accelerations]
+    with torch.no_grad():
+        model, learned = predict(residual.base, transitions), predict(residual, transitions)
+    differences = (transitions.next_state - model, learned - model)
+    return tuple((d[:, rows] / transitions.dt).cpu().double().numpy() for d in differences)
+
+
+def matters(system, transitions, lack, added, share=0.01):
+    """Names of accelerations that the model lacks, or the residual adds, by more than a share of what is flown.
+
+    What turns and what moves are measured apart, each by its largest acceleration. The largest stays if none matters.
+    """
+    rows = [transitions.state_names.index(name) for name in system.accelerations]
+    change = ((transitions.next_state - transitions.state)[:, rows] / transitions.dt).cpu().double().numpy()
+    flown, size = (np.sqrt(np.square(part).mean(0)) for part in (change, np.maximum(np.abs(lack), np.abs(added))))
+    turning = np.array([name in GROUPS["rates"] for name in system.accelerations])
+    largest = [flown[turning == turns].max() for turns in turning]
+    ratio = size / np.maximum(largest, 1e-9)
+    chosen = ratio > min(share, 0.999 * ratio.max())
+    chosen[ratio.argmax()] = True
+    return [name for name, on in zip(system.accelerations, chosen, strict=True) if on]
+
+
+def _draw_lack(axes, lack, added):
+    """Points on and around the diagonal; both directions have the same scale."""
+    both = np.concatenate((lack, added))
+    middle, reach = (both.max() + both.min()) / 2, max(0.55 * (both.max() - both.min()), 0.01)
+    limits = (middle - reach, middle + reach)
+    axes.plot(limits, limits, color=LIGHT, linewidth=7, zorder=1)
+    size = float(np.clip(6000 / len(lack), 8, 40))
+    axes.scatter(lack, added, s=size, color=COLOURS["few_shot"], alpha=0.6, linewidth=0, zorder=2)
+    axes.set(xlim=limits, ylim=limits, aspect="equal")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(3))
+
+
+def _prediction(adaptation, names):
+    """One-step errors on held-out transitions before and after, of the groups that are shown."""
+    before, after = (adaptation.prediction[name] for name in ("model", "model + residual"))
+    units = {"acceleration": ("velocity", "m/s²"), "angular_acceleration": ("rates", "rad/s²")}
+    said = []
+    for key, (group, unit) in units.items():
+        if key in before and set(names) & set(GROUPS[group]):
+            said.append(f"{number(before[key])} → {number(after[key])} {unit}")
+    return "RMS on held-out transitions\n" + ", ".join(said)
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+
+
+def draw_training(adaptation):
+    """Cost and gradient norm over the updates of the fine-tuning."""
+    history, evaluations, scale = adaptation.history, adaptation.evaluations, score_scale(adaptation)
+    update, cost, norm = (np.array([row[key] for row in history]) for key in ("update", "cost", "gradient_norm"))
+    figure = Figure(figsize=(7, 4.8), layout="constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(2.6, 1))
+    colour = COLOURS["few_shot"]
+    for axes, values in ((top, cost), (bottom, norm)):
+        axes.plot(update, values, color=colour, alpha=0.35, linewidth=1.5, label="each update")
+        axes.plot(update, smoothed(values), color=colour, label="smoothed")
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=6))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    top.set_ylabel("cost [-]")
+    top.legend(loc="best")
+    bottom.set_ylabel("gradient\nnorm [-]")
+    bottom.set_xlabel("update of the fine-tuning in model + residual")
+    for name, side in (("zero_shot", "left"), ("few_shot", "right")):
+        said = f"{NAMES[name]}: {score(evaluations[name], scale)}"
+        top.set_title(said, loc=side, color=COLOURS[name], fontweight="bold")
+    figure.align_ylabels()
+    return figure
+
+
+def smoothed(values):
+    """Running median over a tenth of the values, shorter at both ends, without those that aren't finite."""
+    half = max(1, len(values) // 20)
+    windows = [values[max(0, i - half) : i + half + 1] for i in range(len(values))]
+    finite = [window[np.isfinite(window)] for window in windows]
+    return np.array([np.median(window) if len(window) else np.nan for window in finite])
+
+
+PICTURES = {"flight": draw_flight, "error": draw_error, "residual": draw_residual, "training": draw_training}
