@@ -15,6 +15,7 @@ from envs.errors import InputError
 
 OUTPUTS = ("config.json", "metrics.json", "policy.safetensors", "residual.safetensors", "transitions.csv")
 DEFAULT_TARGET = ("drag=0.3",)
+LOG_UPDATES = 600
 NAMES = {"source": "source", "zero_shot": "zero-shot", "few_shot": "few-shot", "oracle": "oracle"}
 Repeatable = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
@@ -40,8 +41,8 @@ class Options:
     """Kind of residual: acceleration, or state as in the paper."""
     exploration: float = 0.1
     """Standard deviation of noise on the actions flown for data, which span -1 to 1."""
-    updates: int = 200
-    """Gradient steps of the fine-tuning."""
+    updates: int | None = None
+    """Gradient steps of the fine-tuning (default: 200; 600 with --log, as a real robot is farther from its model)."""
     oracle: bool = False
     """Also fine-tune in the true target, as a bound."""
     seed: int = 0
@@ -88,7 +89,7 @@ def main(options):
 
 
 def _check(options):
-    if options.updates < 1:
+    if options.updates is not None and options.updates < 1:
         raise InputError(f"--updates {options.updates}: expected at least 1")
     if not 0 <= options.exploration <= 1:
         raise InputError(f"--exploration {options.exploration:g}: expected between 0 and 1")
@@ -185,6 +186,7 @@ def _adapt(options, setting, policy, recorded, folder, device):
         else:
             save_policy(folder / "policy.safetensors", result.network, result.task, result.info)
 
+    updates = options.updates or (LOG_UPDATES if options.log else FINETUNE.updates)
     policy.network.to(device)
     try:
         return adapt(
@@ -195,10 +197,10 @@ def _adapt(options, setting, policy, recorded, folder, device):
             kind=options.residual,
             exploration=options.exploration,
             seed=options.seed,
-            config=replace(FINETUNE, updates=options.updates),
+            config=replace(FINETUNE, updates=updates),
             oracle=options.oracle,
             context=None if recorded is None or recorded.context is None else recorded.context.mean(0),
-            progress=lambda updates: tqdm(updates, total=options.updates, desc="fine-tuning", unit="update"),
+            progress=lambda steps: tqdm(steps, total=updates, desc="fine-tuning", unit="update"),
             stage=lambda name: print(f"{name} ...", flush=True),
             keep=keep,
         )

@@ -208,10 +208,9 @@ def _fit_acceleration(residual, data, train, held, settings, generator):
 
 def _misled(residual, held):
     """Which outputs (k) the linear part explains worse than nothing does, on transitions that it has not seen."""
-    with_it = unexplained(bound(residual, held), held).square().mean(0)
-    blank = make_residual(residual.base, replace(residual.config, hidden=0))
-    without = unexplained(bound(blank, held), held).square().mean(0)
-    return with_it > without + _rounding(residual.system, held).square()
+    rows = [held.state_names.index(name) for name in residual.system.accelerations]
+    errors = [(predict(d, held) - held.next_state)[:, rows].square().mean(0) for d in (residual, residual.base)]
+    return errors[0] > errors[1] + (held.dt * _rounding(residual.system, held)).square()
 
 
 def _choice(residual, fit, stays):
@@ -229,21 +228,25 @@ def _choice(residual, fit, stays):
 def _fit_linear(residual, data, rounds=8):
     """Set weights and bias so that the step, not its start, is explained.
 
-    A push held over a step answers to the mean of the inputs over it, so outputs are regressed on that mean. What the
-    fitted step then still misses is added to what the weights explain, and the regression is repeated: it converges in
-    a few rounds to weights whose own step misses nothing that they can express.
+    A push held over a step answers to the mean of the inputs over it, so outputs are regressed on that mean, along the
+    path that the residual of the last round predicts. (The recorded end of the step would carry its measurement noise
+    into the inputs, and the fit would explain the noise by itself.) What the fitted step then still misses is added to
+    what the weights explain, and the regression is repeated: it converges in a few rounds to weights whose own step
+    misses nothing that they can express.
     """
     residual.weights.zero_()
     residual.bias.zero_()
     seen = bound(residual, data)
     slopes = _push_slopes(seen, data)
     needed = unexplained(seen, data, slopes)
-    inputs = torch.cat((torch.ones(len(data), 1, dtype=torch.float64), _mean_features(seen, data, needed)), -1)
     libraries = _libraries(residual)
     folds, noise = blocks(data.trajectory), _rounding(residual.system, data)
     size = needed.square().mean(0) + (100 * noise).square()
     best, target = (float("inf"), None, None), needed
     for _ in range(rounds):
+        inputs = torch.cat((torch.ones(len(data), 1, dtype=torch.float64), _mean_features(seen, data)), -1)
+        if best[1] is not None:
+            target = inputs @ best[2].T + missed
         fit = fit_sparse(inputs, target, folds, noise, libraries)
         change = (fit.weights - torch.cat((residual.bias[:, None], residual.weights), -1)).abs().max()
         residual.bias.copy_(fit.weights[:, 0])
@@ -252,7 +255,7 @@ def _fit_linear(residual, data, rounds=8):
         error = float((missed.square().mean(0) / size).sum())
         if not error < best[0]:
             break
-        best, target = (error, fit, fit.weights), inputs @ fit.weights.T + missed
+        best = (error, fit, fit.weights)
         if change < SETTLED:
             break
     _, fit, weights = best
@@ -302,13 +305,10 @@ def _push_slopes(residual, data):
     return torch.stack(slopes, 1)
 
 
-def _mean_features(residual, data, push):
-    """Mean (N, f) of what the linear part sees over each step, by Simpson's rule."""
-    base = residual.base
-    half = replace(base, system=replace(base.system, dt=base.dt / 2))
-    x = residual.system.State(*data.state.unbind(-1))
-    middle = half.advance(data.state, data.action, residual.system.residual_rates(x, push.unbind(-1)))
-    ends = residual.features(data.state, data.action) + residual.features(data.next_state, data.action)
+def _mean_features(residual, data):
+    """Mean (N, f) of what the linear part sees over each predicted step, by Simpson's rule."""
+    middle, end = (residual.pushed(data.state, data.action, share=share) for share in (0.5, 1.0))
+    ends = residual.features(data.state, data.action) + residual.features(end, data.action)
     return (ends + 4 * residual.features(middle, data.action)) / 6
 
 

@@ -262,12 +262,15 @@ class AccelerationResidual(ResidualDynamics):
             return self.pushed(state, action)
         return self.pushed(state, action, self.network(self.inputs(state, action)))
 
-    def pushed(self, state, action, push=None):
-        """One control period under the linear part and, if given, a `push` (..., k) held over it."""
+    def pushed(self, state, action, push=None, share=1.0):
+        """A `share` of a control period under the linear part and, if given, a `push` (..., k) held over it."""
         rates = None
         if push is not None:
             rates = self.system.residual_rates(self.system.State(*state.unbind(-1)), push.unbind(-1))
-        return self._with_linear(self._context_for(state)).advance(state, action, rates)
+        dynamics = self._with_linear(self._context_for(state))
+        if share != 1:
+            dynamics = replace(dynamics, system=replace(dynamics.system, dt=share * dynamics.dt))
+        return dynamics.advance(state, action, rates)
 
     def _with_linear(self, context):
         """The base with the linear part as one more disturbance; context (..., c) is constant in a step."""
