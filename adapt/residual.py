@@ -215,7 +215,7 @@ def _misled(residual, held):
 
 def _choice(residual, fit, stays):
     system, names = residual.system, ("1", *residual.feature_names())
-    table = torch.cat((residual.bias[:, None], residual.weights), -1) != 0
+    table = _linear(residual) != 0
     chosen = [tuple(name for name, used in zip(names, row, strict=True) if used) for row in table.tolist()]
     return {
         "inputs": dict(zip(system.accelerations, chosen, strict=True)),
@@ -234,36 +234,40 @@ def _fit_linear(residual, data, rounds=8):
     what the weights explain, and the regression is repeated: it converges in a few rounds to weights whose own step
     misses nothing that they can express.
     """
-    residual.weights.zero_()
-    residual.bias.zero_()
+    _set_linear(residual, torch.zeros(len(residual.bias), 1 + residual.weights.shape[1], dtype=torch.float64))
     seen = bound(residual, data)
     slopes = _push_slopes(seen, data)
-    needed = unexplained(seen, data, slopes)
+    missed = unexplained(seen, data, slopes)
     libraries = _libraries(residual)
     folds, noise = blocks(data.trajectory), _rounding(residual.system, data)
-    size = needed.square().mean(0) + (100 * noise).square()
-    best, target = (float("inf"), None, None), needed
+    size = missed.square().mean(0) + (100 * noise).square()
+    best, weights = (float("inf"), None), _linear(residual)
     for _ in range(rounds):
         inputs = torch.cat((torch.ones(len(data), 1, dtype=torch.float64), _mean_features(seen, data)), -1)
-        if best[1] is not None:
-            target = inputs @ best[2].T + missed
-        fit = fit_sparse(inputs, target, folds, noise, libraries)
-        change = (fit.weights - torch.cat((residual.bias[:, None], residual.weights), -1)).abs().max()
-        residual.bias.copy_(fit.weights[:, 0])
-        residual.weights.copy_(fit.weights[:, 1:])
+        fit = fit_sparse(inputs, inputs @ weights.T + missed, folds, noise, libraries)
+        change, weights = (fit.weights - weights).abs().max(), fit.weights
+        _set_linear(residual, weights)
         missed = unexplained(seen, data, slopes)
         error = float((missed.square().mean(0) / size).sum())
         if not error < best[0]:
             break
-        best = (error, fit, fit.weights)
+        best = (error, fit)
         if change < SETTLED:
             break
-    _, fit, weights = best
-    if fit is None:
+    if best[1] is None:
         raise InputError("transitions: no linear residual gives finite predictions; check units and columns")
-    residual.bias.copy_(weights[:, 0])
-    residual.weights.copy_(weights[:, 1:])
-    return fit
+    _set_linear(residual, best[1].weights)
+    return best[1]
+
+
+def _linear(residual):
+    """Bias and weights as one table (k, 1 + f)."""
+    return torch.cat((residual.bias[:, None], residual.weights), -1)
+
+
+def _set_linear(residual, table):
+    residual.bias.copy_(table[:, 0])
+    residual.weights.copy_(table[:, 1:])
 
 
 def _libraries(residual):
