@@ -8,17 +8,10 @@ import pandas as pd
 import pytest
 import torch
 
-from adapt.logs import (
-    MEMORY,
-    REASONS,
-    convert,
-    flight_transitions,
-    held_command,
-    read_flight,
-    reject,
-    rotation_matrices,
-    window_means,
-)
+from adapt.control_periods import MEMORY, held_command, window_means
+from adapt.log_cleaning import REASONS, reject
+from adapt.log_rows import convert, rotation_matrices
+from adapt.logs import flight_transitions, read_flight
 from adapt.mappings import MAPPINGS
 from envs.dynamics import Dynamics
 from envs.errors import InputError

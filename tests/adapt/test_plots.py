@@ -13,8 +13,10 @@ from matplotlib.figure import Figure
 
 from adapt import plots, video
 from adapt.finetune import Adaptation, finetune
-from adapt.residual import FitSettings, fit_residual, make_residual, prediction_error
-from adapt.transitions import collect
+from adapt.flying import collect
+from adapt.prediction import prediction_error
+from adapt.residual import FitSettings, fit_residual
+from adapt.residual_kinds import make_residual
 from envs import SYSTEMS, make_dynamics, make_system, make_task
 from envs.dynamics import Dynamics
 from envs.errors import InputError

@@ -5,15 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from adapt.residual import (
-    FitSettings,
-    ResidualConfig,
-    fit_residual,
-    load_residual,
-    make_residual,
-    prediction_error,
-    unexplained,
-)
+from adapt.fit_acceleration import unexplained
+from adapt.prediction import prediction_error
+from adapt.residual import FitSettings, fit_residual
+from adapt.residual_dynamics import ResidualConfig
+from adapt.residual_kinds import load_residual, make_residual
 from adapt.transitions import Transitions
 from envs import make_dynamics, make_system
 from envs.errors import InputError

@@ -6,7 +6,8 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from adapt.transitions import Transitions, check, collect
+from adapt.flying import collect
+from adapt.transitions import Transitions, check
 from envs import make_dynamics, make_env, make_system
 from envs.errors import InputError
 

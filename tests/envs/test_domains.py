@@ -58,7 +58,7 @@ def test_every_disturbance_matters_and_vanishes_at_zero_strength(system, name, d
     check_that_it_matters(system, strong, zero, draw)
 
 
-@pytest.mark.parametrize(("system", "name"), every(lambda system: set(DISTURBANCES) - set(parameters(system))))
+@pytest.mark.parametrize(("system", "name"), every(lambda system: sorted(set(DISTURBANCES) - set(parameters(system)))))
 def test_every_disturbance_can_be_written_as_text(system, name):
     assert parse_target(f"{name}=0.3", make_system(system)).disturbances == ((name, (0.3, 0.0, 0.0)),)
 

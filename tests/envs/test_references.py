@@ -8,28 +8,11 @@ import pytest
 import torch
 
 from envs.errors import InputError
-from envs.references import (
-    ACCELERATION,
-    FLAT,
-    JERK,
-    NAMED,
-    POSITION,
-    RANDOM_SETS,
-    SPLITS,
-    VELOCITY,
-    FlightLimits,
-    circle,
-    feasible,
-    flatness,
-    hover,
-    lemniscate,
-    line,
-    minimum_snap,
-    random_polynomials,
-    read_waypoints,
-    snap_hessian,
-    split_generator,
-)
+from envs.flatness import ACCELERATION, FLAT, JERK, POSITION, VELOCITY, FlightLimits, feasible, flatness
+from envs.minimum_snap import minimum_snap, snap_hessian
+from envs.references import RANDOM_SETS, SPLITS, random_polynomials, split_generator
+from envs.shapes import NAMED, circle, hover, lemniscate, line
+from envs.waypoints import read_waypoints
 
 LIMITS = FlightLimits()
 GRAVITY = LIMITS.gravity
