@@ -7,13 +7,13 @@ from importlib import import_module
 
 _HOMES = {
     "Transitions": "transitions",
-    "collect": "transitions",
-    "ResidualDynamics": "residual",
+    "collect": "flying",
+    "ResidualDynamics": "residual_dynamics",
     "fit_residual": "residual",
-    "load_residual": "residual",
-    "prediction_error": "residual",
-    "adapt": "finetune",
-    "finetune": "finetune",
+    "load_residual": "residual_kinds",
+    "prediction_error": "prediction",
+    "adapt": "adaptation",
+    "finetune": "adaptation",
 }
 __all__ = sorted(_HOMES)
 

@@ -1,4 +1,4 @@
-"""What all commands share: options, one-line errors, exit statuses, output folders, files written whole."""
+"""What all commands share: options, one-line errors, exit statuses, output folders."""
 
 import contextlib
 import errno
@@ -13,6 +13,7 @@ import tempfile
 from pathlib import Path
 
 from envs.errors import InputError
+from policies.files import whole
 
 USAGE, INTERRUPTED = 2, 130  # exit statuses
 FULL_OR_FORBIDDEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EROFS, errno.EPERM)
@@ -75,18 +76,6 @@ def output_folder(path, overwrite):
             return folder
     except OSError as error:
         raise InputError(f"--out {folder}: can't be written to ({error.strerror})") from None
-
-
-@contextlib.contextmanager
-def whole(path):
-    """A temporary name beside `path` that takes its place when the block ends well, and vanishes when it doesn't."""
-    path = Path(path)
-    partial = path.with_name(f".partial-{path.name}")
-    try:
-        yield partial
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def write_json(path, content):
@@ -155,6 +144,16 @@ def interrupts_noted():
         yield lambda: bool(came)
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def check_seed(seed):
+    """Refuse a seed that generators can't take.
+
+    Raises:
+        InputError: below 0, or of more than 63 bits.
+    """
+    if not 0 <= seed < 2**63:
+        raise InputError(f"--seed {seed}: expected between 0 and 2^63 - 1")
 
 
 def set_threads(threads):

@@ -52,6 +52,7 @@ def main(options):
     if options.episodes is not None and options.episodes < 1:
         raise InputError(f"--episodes {options.episodes}: expected at least 1")
     out = _out(options)
+    command.check_seed(options.seed)
     command.set_threads(options.threads)
     device = command.pick_device(options.device)
     system, vehicle = command.pick_robot(options.system, options.vehicle)
@@ -66,7 +67,14 @@ def main(options):
     print(f"{options.system} {task.set} {' '.join(options.target) or 'source'}: {task.metric} {result}")
     print(f"time per action: median {spent['median_ms']:.3f} ms, 99th percentile {spent['p99_ms']:.3f} ms, one thread")
     if out:
-        content = {"options": asdict(options), "metric": task.metric, "unit": task.unit, **result.summary, **spent}
+        content = {
+            "options": asdict(options),
+            "set": task.set,
+            "metric": task.metric,
+            "unit": task.unit,
+            **result.summary,
+            **spent,
+        }
         content |= {
             "policy_info": policy.info,
             "table": result.table.to_dict("list"),

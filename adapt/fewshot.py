@@ -72,6 +72,7 @@ class Options:
 def main(options):
     """Check the options, adapt, print, write."""
     _check(options)
+    command.check_seed(options.seed)
     command.set_threads(options.threads)
     device = command.pick_device(options.device)
     setting = _setting(options)
@@ -103,7 +104,8 @@ def _check(options):
         raise InputError("--validate: needs --log to learn from")
     if options.log and (options.target or options.oracle):
         raise InputError("--log: a recorded flight is the target; leave out --target and --oracle")
-    from adapt.residual import MINIMUM, RESIDUALS
+    from adapt.residual import MINIMUM
+    from adapt.residual_kinds import RESIDUALS
 
     if options.residual not in RESIDUALS:
         raise InputError(f"--residual {options.residual}: expected one of {', '.join(RESIDUALS)}")
@@ -172,7 +174,7 @@ def _default_folder(options):
 def _adapt(options, setting, policy, recorded, folder, device):
     from tqdm import tqdm
 
-    from adapt.finetune import FINETUNE, adapt
+    from adapt.adaptation import FINETUNE, adapt
     from policies.checkpoints import save_policy
 
     report = {"options": asdict(options), **command.environment(options.seed, options.threads)}

@@ -15,9 +15,9 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
-from adapt.command import whole
-from adapt.residual import GROUPS, predict
+from adapt.prediction import GROUPS, predict
 from envs.system import Axis
+from policies.files import whole
 
 DPI = 150
 GREY, LIGHT = "#595959", "#BDBDBD"

@@ -1,9 +1,56 @@
-"""How well dynamics predict flights that they have not seen, over one control period and ahead in open loop."""
+"""How well dynamics predict what was recorded, over one control period and ahead in open loop."""
 
 import torch
 
-from adapt.residual import bound, predict
+from adapt.residual_dynamics import ResidualDynamics
+from adapt.transitions import QUATERNION
 from envs.errors import InputError
+
+# Rows of the state by what they measure: prediction errors are reported for each group that a system has.
+GROUPS = {
+    "position": ("px", "py", "pz", "x"),
+    "velocity": ("vx", "vy", "vz", "u_b", "v_b", "w_b", "v"),
+    "attitude": (*QUATERNION, "theta"),
+    "rates": ("p", "q", "r", "omega"),
+}
+
+
+@torch.no_grad()
+def prediction_error(dynamics, transitions):
+    """One-step errors of dynamics: root mean square of the norm of each group of rows in `GROUPS` that the system has.
+
+    position [m], velocity [m/s], attitude [- for quaternions, else rad], rates [rad/s], and `acceleration` [m/s^2] and
+    `angular_acceleration` [rad/s^2], the errors of velocity and rates over the control period.
+    """
+    difference = predict(dynamics, transitions) - transitions.next_state
+    names = transitions.state_names
+    errors = {}
+    for group, members in GROUPS.items():
+        if rows := [i for i, name in enumerate(names) if name in members]:
+            errors[group] = float(difference[:, rows].square().sum(-1).mean().sqrt())
+    for rate, group in (("acceleration", "velocity"), ("angular_acceleration", "rates")):
+        if group in errors:
+            errors[rate] = errors[group] / transitions.dt
+    return errors
+
+
+def predict(dynamics, transitions):
+    """Next states (N, n) that dynamics predict; a quaternion has the sign of the recorded one."""
+    following = bound(dynamics, transitions)(transitions.state, transitions.action)
+    if set(QUATERNION) <= set(transitions.state_names):
+        columns = [transitions.state_names.index(name) for name in QUATERNION]
+        agrees = (following[:, columns] * transitions.next_state[:, columns]).sum(-1, keepdim=True) >= 0
+        sign = torch.ones_like(following)
+        sign[:, columns] = torch.where(agrees, 1.0, -1.0).to(following).expand(-1, 4)
+        following = following * sign
+    return following
+
+
+def bound(dynamics, transitions):
+    """Dynamics that see the context of the transitions, row by row, if they take any."""
+    if isinstance(dynamics, ResidualDynamics) and dynamics.config.context_names:
+        return dynamics.with_context(transitions.context)
+    return dynamics
 
 
 @torch.no_grad()

@@ -10,6 +10,7 @@ import tyro
 
 from adapt import command
 from envs.errors import InputError
+from policies.files import whole
 
 OUTPUTS = ("policy.safetensors", "log.csv", "training.pt")
 LOG = ("update", "seconds", "cost", "gradient_norm", "threshold", "stage", "resets", "skipped", "error", "success")
@@ -72,6 +73,7 @@ def main(options):
     from envs import make_dynamics, make_task
     from policies import apg
 
+    command.check_seed(options.seed)
     command.set_threads(options.threads)
     device = command.pick_device(options.device)
     if options.every < 1:
@@ -237,7 +239,7 @@ def _save_training(run, folder, identity):
 
     content = io.BytesIO()  # written by Python, whose errors name the file and the reason; torch's don't
     torch.save({**run.state_dict(), "identity": identity}, content)
-    with command.whole(folder / "training.pt") as partial:
+    with whole(folder / "training.pt") as partial:
         partial.write_bytes(content.getvalue())
 
 
@@ -253,7 +255,7 @@ class Log:
     def write(self, row):
         """Add a row; the file on disk is always whole."""
         self.rows.append({key: row[key] for key in LOG})
-        with command.whole(self.path) as partial, partial.open("w", newline="") as file:
+        with whole(self.path) as partial, partial.open("w", newline="") as file:
             writer = csv.DictWriter(file, LOG)
             writer.writeheader()
             writer.writerows(self.rows)

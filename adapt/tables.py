@@ -13,6 +13,7 @@ import tyro
 
 from adapt import command
 from envs.errors import InputError
+from policies.files import whole
 
 STAGES = ("source", "zero_shot", "few_shot", "oracle")
 
@@ -35,7 +36,7 @@ def main(options):
     keys = [key for key in ("system", "set", "target", "samples") if key in table]
     table = table.sort_values([*keys, "seed"], ignore_index=True)
     if options.csv:
-        with command.whole(options.csv) as partial:
+        with whole(options.csv) as partial:
             table.to_csv(partial, index=False)
     print(summary(table, keys).to_markdown(index=False))
 
@@ -87,7 +88,7 @@ def _fewshot_row(path, metrics):
 
 def _evaluation_row(metrics):
     options = metrics["options"]
-    row = {"system": options["vehicle"] or options["system"], "set": options["set"] or ""}
+    row = {"system": options["vehicle"] or options["system"], "set": metrics["set"]}
     row |= {
         "target": " ".join(options["target"]),
         "policy": options["policy"] or "",

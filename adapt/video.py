@@ -12,10 +12,10 @@ import numpy as np
 import torch
 
 from adapt import plots
-from adapt.command import whole
 from adapt.plots import COLOURS, GREY, LIGHT
 from envs.dynamics import TORCH
 from envs.errors import InputError
+from policies.files import whole
 
 PANEL = (640, 540)  # [pixel] width and height of one flight's picture; half as high where flights stand one on another
 MARGIN = 50  # [pixel] around the scene

@@ -13,7 +13,10 @@ import torch
 
 from envs import references, rigid_body
 from envs.errors import InputError
+from envs.flatness import FlightLimits, flatness
+from envs.shapes import NAMED
 from envs.system import Axis, System, Task
+from envs.waypoints import read_waypoints
 
 
 class State(NamedTuple):
@@ -133,7 +136,7 @@ class Quadrotor(System):
     def flight_limits(self):
         """The limits that a reference must respect."""
         rates = (self.rate_limit_x, self.rate_limit_y, self.rate_limit_z)
-        return references.FlightLimits(self.gravity, self.thrust_min, self.thrust_max, *rates)
+        return FlightLimits(self.gravity, self.thrust_min, self.thrust_max, *rates)
 
     def derivative(self, x, u):
         mass, _ = self.believed
@@ -209,9 +212,9 @@ def _moved(x, point):
 class Tracking(Task):
     """Follow a path in space and time.
 
-    An episode is a reference of flat points (steps + horizon + 1, 12) of `references`. It starts on the reference, with
-    the attitude and body rates that flatness gives. Metric: mean distance to the reference; success: never 5 m off.
-    `set` is a random set, a named curve, or a CSV file of waypoints.
+    An episode is a reference of flat points (steps + horizon + 1, 12), see `envs.flatness`. It starts on the reference,
+    with the attitude and body rates that flatness gives. `set` is a random set, a named curve, or a CSV file of
+    waypoints. Metric: mean distance to the reference; success: never 5 m off.
     """
 
     metric: ClassVar[str] = "mean position error"
@@ -227,7 +230,7 @@ class Tracking(Task):
         "thrust": 5 / 4,
         **dict.fromkeys(("p_des", "q_des", "r_des"), 0.1 / 4),
     }
-    sets: ClassVar[tuple[str, ...]] = (*references.RANDOM_SETS, *references.NAMED)
+    sets: ClassVar[tuple[str, ...]] = (*references.RANDOM_SETS, *NAMED)
     encoder: ClassVar[str] = "conv"
     thresholds: ClassVar[tuple[float, float]] = (0.1, 2.0)
     speeds: ClassVar[tuple[float, ...]] = (0.5, 0.75, 1.0)
@@ -249,13 +252,13 @@ class Tracking(Task):
         if self.set in references.RANDOM_SETS:
             chance = {"limits": self.system.flight_limits, "generator": references.split_generator(split, seed)}
             return references.random_polynomials(n, kind=self.set, speed=speed, **span, **chance)
-        if self.set in references.NAMED:
-            return references.NAMED[self.set](**span).expand(n, -1, -1)
-        return references.read_waypoints(self.set, **span).expand(n, -1, -1)
+        if self.set in NAMED:
+            return NAMED[self.set](**span).expand(n, -1, -1)
+        return read_waypoints(self.set, **span).expand(n, -1, -1)
 
     def start(self, episodes, step):
         point = episodes[torch.arange(len(episodes), device=episodes.device), step]
-        _, quaternion, rates = references.flatness(point, self.system.gravity)
+        _, quaternion, rates = flatness(point, self.system.gravity)
         return torch.cat((point[:, :3], quaternion, point[:, 3:6], rates), -1)
 
     def reference(self, episodes, step, state):

@@ -5,7 +5,6 @@ the weights were trained for, and a checkpoint is refused where that differs fro
 """
 
 import json
-import os
 from dataclasses import asdict, dataclass, fields, replace
 from importlib import resources
 from pathlib import Path
@@ -16,6 +15,7 @@ from safetensors.torch import save
 
 from envs.errors import InputError
 from envs.registry import make_system, make_task
+from policies.files import whole
 from policies.networks import NetworkConfig, PlanNetwork
 
 FORMAT = "apg-adapt policy 1"
@@ -39,14 +39,9 @@ def save_policy(path, network, task, info):
         "task": json.dumps({"set": task.set, "steps": task.steps, "horizon": task.horizon}),
         "info": json.dumps(info),
     }
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.partial")
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
-    try:
+    with whole(path) as partial:
         partial.write_bytes(save(tensors, metadata))
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def read_tensors(path, format, what):

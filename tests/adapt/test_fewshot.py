@@ -140,6 +140,7 @@ def test_the_transitions_are_those_of_the_target_and_can_be_given_back(call, fin
         assert after[key] == before[key], key
 
 
+@pytest.mark.slow
 def test_recorded_transitions_alone_stand_for_the_target(call, finished, quick, tmp_path):
     answer = call("fewshot", *quick, "--transitions", finished[0] / "transitions.csv", "--out", tmp_path / "run")
     assert answer.status == 0
@@ -307,7 +308,7 @@ def ctrl_c(*args, **kwargs):
 @pytest.mark.parametrize(
     ("place", "left"),
     [
-        ("adapt.finetune.collect", {"config.json"}),
+        ("adapt.adaptation.collect", {"config.json"}),
         ("adapt.residual.fit_residual", {"config.json", "transitions.csv"}),
         ("policies.apg.learning_rate", {"config.json", "transitions.csv", "residual.safetensors"}),
         ("adapt.fewshot._metrics", FILES - {"metrics.json"}),
@@ -329,6 +330,7 @@ def test_ctrl_c_at_any_stage_keeps_what_was_finished(call, cart, tmp_path, monke
         assert load_policy(tmp_path / "policy.safetensors").info["finetuned_updates"] == 3
 
 
+@pytest.mark.slow
 def test_an_interrupted_overwriting_run_does_not_keep_results_of_the_old_one(call, cart, tmp_path, monkeypatch):
     assert call("fewshot", *cart, "--out", tmp_path).status == 0
     monkeypatch.setattr(apg, "learning_rate", ctrl_c)
@@ -336,7 +338,7 @@ def test_an_interrupted_overwriting_run_does_not_keep_results_of_the_old_one(cal
     assert {path.name for path in tmp_path.iterdir()} == {"config.json", "transitions.csv", "residual.safetensors"}
 
 
-@pytest.mark.parametrize("name", ["config.json", "metrics.json", "policy.safetensors"])
+@pytest.mark.parametrize("name", ["config.json", "metrics.json", "policy.safetensors", "residual.safetensors"])
 def test_a_disk_that_fills_up_leaves_whole_files_only(refused, cart, tmp_path, monkeypatch, name):
     def filling(write, half):
         def written(path, content, *args, **kwargs):

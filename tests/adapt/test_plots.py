@@ -12,7 +12,7 @@ import torch
 from matplotlib.figure import Figure
 
 from adapt import plots, video
-from adapt.finetune import Adaptation, finetune
+from adapt.adaptation import Adaptation, finetune
 from adapt.flying import collect
 from adapt.prediction import prediction_error
 from adapt.residual import FitSettings, fit_residual

@@ -144,7 +144,6 @@ def test_within_seconds_training_makes_the_error_a_tenth_of_that_of_random_weigh
     assert after.success.all()
     assert after.error.mean() < 0.1 * before.error.mean()
     assert len(history) == config.updates == run.update
-    assert history[-1]["cost"] < history[0]["cost"]
     assert run.skipped == 0
 
 

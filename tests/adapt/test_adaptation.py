@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from adapt.finetune import FINETUNE, Clock, adapt, finetune
+from adapt.adaptation import FINETUNE, Clock, adapt, finetune
 from adapt.flying import collect
 from adapt.residual import MINIMUM
 from adapt.transitions import Transitions
@@ -127,6 +127,7 @@ def flown(policy, target, n):
     return collect(as_actor(policy.network), env, n, 0.1, torch.Generator().manual_seed(0))
 
 
+@pytest.mark.slow
 def test_recorded_transitions_are_used_as_they_are(rough_cartpole, target):
     recorded = flown(rough_cartpole, target, 150)
     result = adapt(rough_cartpole, target, transitions=recorded, samples=9, config=QUICK)

@@ -10,7 +10,10 @@ from dataclasses import dataclass, field
 import torch
 
 from adapt import residual as residuals
-from adapt.transitions import Transitions, collect
+from adapt.flying import collect
+from adapt.prediction import prediction_error
+from adapt.residual_dynamics import ResidualDynamics
+from adapt.transitions import Transitions
 from envs.dynamics import Dynamics
 from envs.env import TrackingEnv
 from envs.errors import InputError
@@ -21,8 +24,9 @@ from policies.networks import as_actor
 
 HELD_OUT = 1000  # transitions flown for the report alone, to measure the prediction error
 
-# The policy is trained already: no curriculum, a lower learning rate, few updates.
-FINETUNE = apg.APGConfig(updates=200, learning_rate=1e-3, curriculum=0.0, warmup=0.05, episodes=1000)
+# The policy is trained already: no curriculum, a lower learning rate, few updates. They visit few states, so these are
+# spread by more noise than in training; without it a rare flight far from the others can get worse.
+FINETUNE = apg.APGConfig(updates=200, learning_rate=1e-3, curriculum=0.0, warmup=0.05, exploration=0.2, episodes=1000)
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class Adaptation:
     """What `adapt` returns: the new policy, the residual it was tuned in, and the evidence."""
 
     policy: Policy
-    residual: residuals.ResidualDynamics
+    residual: ResidualDynamics
     transitions: Transitions
     fit: residuals.FitReport
     evaluations: dict[str, Evaluation]  # source, zero_shot, few_shot and perhaps oracle
@@ -122,7 +126,7 @@ def adapt(
     prediction = {"model": fit.before, "model + residual": fit.after}
     if held_out is not None:
         both = (("model", source), ("model + residual", residual))
-        prediction = {name: residuals.prediction_error(dynamics, held_out) for name, dynamics in both}
+        prediction = {name: prediction_error(dynamics, held_out) for name, dynamics in both}
     learned = (residual if context is None else residual.with_context(context)).to(device)
     clock.next("finetune")
     tuned, history = finetune(policy, learned, config, seed, progress)

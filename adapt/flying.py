@@ -1,0 +1,82 @@
+"""Fly a policy in a target to record transitions."""
+
+import math
+
+import torch
+
+from adapt.transitions import Transitions
+from envs.errors import InputError
+
+
+def collect(policy, env, n, exploration=0.0, generator=None):
+    """Fly a policy in a target until `n` transitions are recorded; no gradient.
+
+    Whole trajectories count one after another, the last one as far as it is needed: 1000 are ten flights of 100 steps,
+    30 are the beginning of one. What follows the end of an episode isn't used.
+
+    Args:
+        policy: TensorDict module that reads `observation` and `window` and writes `action`.
+        env: `TrackingEnv` of the target, or the (dynamics, task, episodes) to make one of. Its episodes are flown in
+            random order, each again only after all others.
+        exploration: standard deviation of Gaussian noise on the actions, which stay in [-1, 1].
+        generator: draws episodes and noise; None is a fresh one with seed 0.
+
+    Raises:
+        InputError: `n` below 1, negative exploration, or a policy whose flights aren't finite.
+    """
+    if n < 1:
+        raise InputError(f"collect: {n} transitions asked for, expected at least 1")
+    if not 0 <= exploration < math.inf:
+        raise InputError(f"collect: exploration is {exploration:g}, expected at least 0")
+    if isinstance(env, tuple):
+        from envs.env import TrackingEnv
+
+        env = TrackingEnv(*env)
+    generator = generator or torch.Generator().manual_seed(0)
+    flights, missing, queue = [], n, []
+    while missing > 0:
+        count = math.ceil(missing / env.task.steps)
+        while len(queue) < count:
+            queue.extend(torch.randperm(len(env.episodes), generator=generator).tolist())
+        flown = _fly(policy, env, queue[:count], min(missing, env.task.steps), exploration, generator)
+        queue = queue[count:]
+        if not any(len(state) for state, _, _ in flown):
+            raise InputError(
+                "collect: every flight failed at once; the policy or the target gives numbers that aren't finite"
+            )
+        for flight in flown:
+            flights.append(tuple(part[:missing] for part in flight))
+            missing -= len(flights[-1][0])
+    return _joined([flight for flight in flights if len(flight[0])], env.dynamics.system)
+
+
+@torch.no_grad()
+def _fly(policy, env, episodes, steps, exploration, generator):
+    """Fly episodes side by side: for each, (state, action, next_state) up to its end."""
+    from tensordict import TensorDict
+    from torchrl.envs.utils import step_mdp
+
+    start = TensorDict({"episode": torch.tensor(episodes).unsqueeze(-1)}, batch_size=len(episodes), device=env.device)
+    now, record = env.reset(start), []
+    flying = torch.ones(len(episodes), dtype=torch.bool)
+    for _ in range(steps):
+        now = policy(now)
+        noise = exploration * torch.randn(now["action"].shape, generator=generator).to(now["action"])
+        now["action"] = (now["action"] + noise).clamp(-1, 1)
+        now = env.step(now)
+        rows = tuple(part.cpu() for part in (now["state"], now["action"], now["next", "state"]))
+        flying = flying & torch.cat(rows, -1).isfinite().all(-1)
+        record.append((*rows, flying))
+        flying = flying & ~now["next", "done"].squeeze(-1).cpu()
+        if not flying.any():
+            break
+        now = step_mdp(now)
+    *parts, valid = (torch.stack(series, 1) for series in zip(*record, strict=True))
+    return [tuple(part[i][valid[i]] for part in parts) for i in range(len(episodes))]
+
+
+def _joined(flights, system):
+    state, action, next_state = (torch.cat(parts) for parts in zip(*flights, strict=True))
+    trajectory = torch.cat([torch.full((len(flight[0]),), i, dtype=torch.int64) for i, flight in enumerate(flights)])
+    names = (system.State._fields, system.Action._fields)
+    return Transitions(state, action, next_state, trajectory, system.dt, system.name, *names)
