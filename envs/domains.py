@@ -92,6 +92,8 @@ def _changes(item, name, value, system, earlier):
     members = system.groups.get(name, (name,))
     if value.startswith("x"):
         factor = _number(item, value[1:])
+        if not any(getattr(system, field) for field in members):
+            raise InputError(f"--target {item}: {name} is 0, which no factor changes; give a value such as {name}=0.1")
         return {field: factor * earlier.get(field, getattr(system, field)) for field in members}
     if len(members) > 1:
         raise InputError(f"--target {item}: {name} stands for {', '.join(members)}; give a factor such as {name}=x1.2")

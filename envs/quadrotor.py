@@ -77,7 +77,8 @@ class Quadrotor(System):
     bounds: ClassVar[dict[str, tuple[float, float]]] = {
         **dict.fromkeys(
             ("dt", "mass", "inertia_x", "inertia_y", "inertia_z", "rate_gain_x", "rate_gain_y", "rate_gain_z")
-            + ("thrust_max", "rate_limit_x", "rate_limit_y", "rate_limit_z"),
+            + ("thrust_max", "rate_limit_x", "rate_limit_y", "rate_limit_z")
+            + ("controller_mass", "controller_inertia_x", "controller_inertia_y", "controller_inertia_z"),
             (0.0, math.inf),
         ),
         **dict.fromkeys(("gravity", "thrust_min"), (-1e-9, math.inf)),
@@ -231,6 +232,7 @@ class Tracking(Task):
         **dict.fromkeys(("p_des", "q_des", "r_des"), 0.1 / 4),
     }
     sets: ClassVar[tuple[str, ...]] = (*references.RANDOM_SETS, *NAMED)
+    reads_waypoints: ClassVar[bool] = True
     encoder: ClassVar[str] = "conv"
     thresholds: ClassVar[tuple[float, float]] = (0.1, 2.0)
     speeds: ClassVar[tuple[float, ...]] = (0.5, 0.75, 1.0)
@@ -241,11 +243,6 @@ class Tracking(Task):
     system: Quadrotor = Quadrotor()
     set: str = "paper"
     steps: int = 100
-
-    def __post_init__(self):
-        Task.__post_init__(self)
-        if self.set not in self.sets and not self.set.endswith(".csv"):
-            raise InputError(f"--set {self.set}: expected one of {', '.join(self.sets)}, or a CSV file of waypoints")
 
     def episodes(self, n, split, seed, speed=1.0):
         span = {"steps": self.steps + self.horizon + 1, "dt": self.system.dt}

@@ -50,7 +50,10 @@ class System(ABC):
                 raise InputError(f"{self.name}: {field.name} is {value}, expected a finite number")
             low, high = self.bounds.get(field.name, (-math.inf, math.inf))
             if isinstance(value, float | int) and not low < value < high:
-                raise InputError(f"{self.name}: {field.name} is {value:g}, expected between {low:g} and {high:g}")
+                wanted = (
+                    f"between {low:g} and {high:g}" if high < math.inf else ("more than 0" if low == 0 else "0 or more")
+                )
+                raise InputError(f"{self.name}: {field.name} is {value:g}, expected {wanted}")
 
     @abstractmethod
     def derivative(self, x, u):
@@ -116,6 +119,7 @@ class Task(ABC):
     state_weights: ClassVar[dict[str, float]]
     action_weights: ClassVar[dict[str, float]]  # on the squared distance from the trim action
     sets: ClassVar[tuple[str, ...]]  # names of the families of episodes; the first is the default
+    reads_waypoints: ClassVar[bool] = False  # whether `set` may name a CSV file
     encoder: ClassVar[str]  # how a policy reads the reference: "conv", "linear" or "none"
     thresholds: ClassVar[tuple[float, float]]  # first and last divergence threshold of the curriculum
     speeds: ClassVar[tuple[float, ...]] = (1.0,)  # speeds of the curriculum
@@ -131,6 +135,9 @@ class Task(ABC):
     def __post_init__(self):
         if self.horizon < 1:
             raise InputError(f"horizon is {self.horizon}, expected at least 1")
+        if self.set not in self.sets and not (self.reads_waypoints and self.set.endswith(".csv")):
+            known = ", ".join(self.sets) + (", or a CSV file of waypoints" if self.reads_waypoints else "")
+            raise InputError(f"--set {self.set}: {self.system.name} has {known}")
 
     @abstractmethod
     def episodes(self, n, split, seed, speed=1.0):

@@ -245,3 +245,8 @@ def test_a_robot_with_a_parameter_that_is_not_finite_is_refused(nominal, value):
         if isinstance(getattr(nominal, field.name), float):
             with pytest.raises(InputError, match=f"{nominal.name}: {field.name} is .*expected a finite number"):
                 replace(nominal, **{field.name: value})
+
+
+def test_a_factor_on_a_parameter_that_is_zero_is_refused():
+    with pytest.raises(InputError, match="thrust_loss is 0, which no factor changes"):
+        make_dynamics("quadrotor", "thrust_loss=x1.2")

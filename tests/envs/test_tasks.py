@@ -388,3 +388,10 @@ def test_a_task_flies_the_system_it_is_given():
     for system in (replace(CartPole(), pole_mass=0.2), replace(Quadrotor(), mass=1.0), replace(FixedWing(), mass=2.0)):
         assert make_task(system).system == system
         assert make_task(system.name).system == make_system(system.name)
+
+
+@pytest.mark.parametrize("name", ["cartpole", "quadrotor", "fixed_wing"])
+def test_an_unknown_set_is_refused_and_the_known_ones_are_named(name):
+    with pytest.raises(InputError, match="--set bogus: .* has ") as refused:
+        make_task(name, "bogus")
+    assert all(known in str(refused.value) for known in make_task(name).sets)
