@@ -50,9 +50,8 @@ class System(ABC):
                 raise InputError(f"{self.name}: {field.name} is {value}, expected a finite number")
             low, high = self.bounds.get(field.name, (-math.inf, math.inf))
             if isinstance(value, float | int) and not low < value < high:
-                wanted = (
-                    f"between {low:g} and {high:g}" if high < math.inf else ("more than 0" if low == 0 else "0 or more")
-                )
+                open_ended = "more than 0" if low == 0 else "0 or more"
+                wanted = f"between {low:g} and {high:g}" if high < math.inf else open_ended
                 raise InputError(f"{self.name}: {field.name} is {value:g}, expected {wanted}")
 
     @abstractmethod
@@ -137,7 +136,7 @@ class Task(ABC):
             raise InputError(f"horizon is {self.horizon}, expected at least 1")
         if self.set not in self.sets and not (self.reads_waypoints and self.set.endswith(".csv")):
             known = ", ".join(self.sets) + (", or a CSV file of waypoints" if self.reads_waypoints else "")
-            raise InputError(f"--set {self.set}: {self.system.name} has {known}")
+            raise InputError(f"--set {self.set}: expected one of {known}")
 
     @abstractmethod
     def episodes(self, n, split, seed, speed=1.0):

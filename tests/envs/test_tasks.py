@@ -392,6 +392,6 @@ def test_a_task_flies_the_system_it_is_given():
 
 @pytest.mark.parametrize("name", ["cartpole", "quadrotor", "fixed_wing"])
 def test_an_unknown_set_is_refused_and_the_known_ones_are_named(name):
-    with pytest.raises(InputError, match="--set bogus: .* has ") as refused:
+    with pytest.raises(InputError, match="--set bogus: expected one of ") as refused:
         make_task(name, "bogus")
     assert all(known in str(refused.value) for known in make_task(name).sets)
