@@ -2,6 +2,7 @@
 
 import os
 import random
+import signal
 
 # Read while torch, TorchRL and matplotlib are imported; the commands that tests start inherit them.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -11,6 +12,9 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 import numpy as np
 import pytest
 import torch
+
+# A shell makes what it starts in the background ignore Ctrl-C, and children inherit that; some tests press it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # More threads make small batches slower and erratic on a busy machine, and sums depend on how many there are.
 torch.set_num_threads(1)
