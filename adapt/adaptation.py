@@ -5,7 +5,7 @@ The target's equations are used for nothing but flying in it: the residual and t
 
 import copy
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 
@@ -93,7 +93,7 @@ def adapt(
         exploration: standard deviation of noise on the actions flown for data.
         config: `APGConfig` of the fine-tuning.
         oracle: also fine-tune for as long in the true target, as a bound of what data could give.
-        context: values of the residual's context while the policy is tuned and evaluated.
+        context: values of the residual's context while the policy is tuned and evaluated (default: the recorded mean).
         progress: wraps iterables of updates, as `tqdm` does.
         stage: called with the name of each stage as it begins.
         keep: called with "transitions", "residual" and "policy" and the result, as soon as each exists.
@@ -119,6 +119,11 @@ def adapt(
             transitions = _flown(actor, target, task, samples, exploration, seed, device)
         unseen = task.episodes(20, "validation", seed).to(device)
         held_out = collect(actor, TrackingEnv(target, task, unseen, device=device), HELD_OUT)
+    if transitions.context is not None:
+        context = transitions.context.mean(0) if context is None else torch.as_tensor(context)
+        held_out = held_out and replace(
+            held_out, context=context.expand(len(held_out), -1), context_names=transitions.context_names
+        )
     keep("transitions", transitions)
     clock.next("fit")
     residual, fit = residuals.fit_residual(transitions, source, kind, seed)
@@ -127,7 +132,8 @@ def adapt(
     if held_out is not None:
         both = (("model", source), ("model + residual", residual))
         prediction = {name: prediction_error(dynamics, held_out) for name, dynamics in both}
-    learned = (residual if context is None else residual.with_context(context)).to(device)
+    # A copy: what is returned stays on the CPU, where the transitions are.
+    learned = copy.deepcopy(residual if context is None else residual.with_context(context)).to(device)
     clock.next("finetune")
     tuned, history = finetune(policy, learned, config, seed, progress)
     keep("policy", tuned)

@@ -33,7 +33,7 @@ def run(name, options, main):
     except KeyboardInterrupt as interrupt:
         sys.exit(_fail(prefix, f"interrupted; {interrupt}" if str(interrupt) else "interrupted", INTERRUPTED))
     except OSError as error:
-        if error.errno not in FULL_OR_FORBIDDEN:
+        if error.filename is None and error.errno not in FULL_OR_FORBIDDEN:  # no path of the user's: a fault of ours
             raise
         sys.exit(_fail(prefix, f"{error.filename or 'output'}: {error.strerror}; nothing half-written is kept", USAGE))
 
@@ -122,7 +122,8 @@ def pick_policy(path, system, vehicle):
     name = vehicle.name if vehicle else system.name
     if path is None and pretrained(name) is None:
         option = "vehicle" if vehicle else "system"
-        raise InputError(f"--policy: none ships for {name}; train one with python -m adapt.pretrain --{option} {name}")
+        advice = f"train one with python -m adapt.pretrain and the same --{option}, then name its policy.safetensors"
+        raise InputError(f"--policy: none ships for {name}; {advice}")
     return load_policy(path or name, system)
 
 

@@ -11,6 +11,9 @@ import numpy as np
 from adapt.log_rows import rotation_matrices, to_body
 
 MEMORY = 0.3  # [s] time constant of the context's mean; on flights left out of the fit 0.1 and 1 s predict worse
+# [s] Logged velocities are smoothed, and a smoothed value knows the near future. What is closer than this to the start
+# of a period stays out of its context: half the width of the smoothing in motion-capture logs (0.13 s) and a little.
+BLIND = 0.15
 FORCE_NAMES = ("force_x", "force_y", "force_z")
 
 
@@ -92,7 +95,7 @@ def _actions(run, knots, states, system, delay):
 
 
 def _context(run, starts, gravity, delay):
-    """Context (K, c) from the rows up to each of the times `starts` (K,)."""
+    """Context (K, c) from the rows up to `BLIND` before each of the times `starts` (K,)."""
     force = _backward_slope(run.time, run.velocity) + [0.0, 0.0, gravity]
     force = to_body(rotation_matrices(run.attitude), force)
     late_thrust = np.interp(run.time - delay, run.time, run.thrust)
@@ -100,7 +103,8 @@ def _context(run, starts, gravity, delay):
     columns = _recent_mean(run.time, surplus, MEMORY)
     if run.voltage is not None:
         columns = np.concatenate((run.voltage[:, None], columns), 1)
-    return columns[np.searchsorted(run.time, starts + 1e-6, side="right") - 1]
+    rows = np.searchsorted(run.time, starts - BLIND + 1e-6, side="right") - 1
+    return columns[rows]
 
 
 def _backward_slope(time, values):

@@ -13,7 +13,8 @@ import tyro
 from adapt import command
 from envs.errors import InputError
 
-OUTPUTS = ("config.json", "metrics.json", "policy.safetensors", "residual.safetensors", "transitions.csv")
+RESULTS = ("config.json", "metrics.json", "policy.safetensors", "residual.safetensors", "transitions.csv")
+PICTURES = ("flight.png", "error.png", "residual.png", "training.png", "flight.mp4")
 DEFAULT_TARGET = ("drag=0.3",)
 LOG_UPDATES = 600
 NAMES = {"source": "source", "zero_shot": "zero-shot", "few_shot": "few-shot", "oracle": "oracle"}
@@ -79,7 +80,7 @@ def main(options):
     policy = _policy(options, setting)
     recorded, validation = _recorded(options, setting)
     folder = command.output_folder(options.out or _default_folder(options), options.overwrite)
-    for name in OUTPUTS:  # what an earlier run left must not be taken for this one's
+    for name in (*RESULTS, *PICTURES):  # what an earlier run left must not be taken for this one's
         (folder / name).unlink(missing_ok=True)
     adaptation = _adapt(options, setting, policy, recorded, folder, device)
     metrics = _metrics(options, policy, adaptation, validation)
@@ -102,6 +103,9 @@ def _check(options):
         raise InputError("--log: needs --vehicle, which says what the motor commands mean")
     if options.validate and not options.log:
         raise InputError("--validate: needs --log to learn from")
+    learned = {Path(path).resolve() for path in options.log}
+    if both := [path for path in options.validate if Path(path).resolve() in learned]:
+        raise InputError(f"--validate {both[0]}: is learned from with --log; give flights that are not")
     if options.log and (options.target or options.oracle):
         raise InputError("--log: a recorded flight is the target; leave out --target and --oracle")
     from adapt.residual import MINIMUM
@@ -135,10 +139,10 @@ def _policy(options, setting):
     from envs.registry import make_task
 
     policy = command.pick_policy(options.policy, setting.system, setting.vehicle)
-    if options.set is None:
-        return policy
-    task = make_task(setting.system, options.set, horizon=policy.task.horizon)
-    return replace(policy, task=task)
+    if options.set is not None:
+        policy = replace(policy, task=make_task(setting.system, options.set, horizon=policy.task.horizon))
+    policy.task.episodes(1, "train", 0)  # waypoints that can't be read or flown are told before anything is written
+    return policy
 
 
 def _recorded(options, setting):
@@ -150,7 +154,13 @@ def _recorded(options, setting):
         return Transitions.load(options.transitions, setting.system, MINIMUM), None
     if not options.log:
         return None, None
-    return _flights(options.log, options, setting), _flights(options.validate, options, setting)
+    recorded, validation = (_flights(paths, options, setting) for paths in (options.log, options.validate))
+    if validation is not None:
+        from adapt.prediction import prediction_report
+        from envs.dynamics import Dynamics
+
+        prediction_report(Dynamics(setting.system), validation)  # flights that are too short are told before the work
+    return recorded, validation
 
 
 def _flights(paths, options, setting):
@@ -188,7 +198,7 @@ def _adapt(options, setting, policy, recorded, folder, device):
         else:
             save_policy(folder / "policy.safetensors", result.network, result.task, result.info)
 
-    updates = options.updates or (LOG_UPDATES if options.log else FINETUNE.updates)
+    updates = _updates(options)
     policy.network.to(device)
     try:
         return adapt(
@@ -210,14 +220,22 @@ def _adapt(options, setting, policy, recorded, folder, device):
         raise KeyboardInterrupt(f"what was finished is in {folder}") from None
 
 
+def _updates(options):
+    from adapt.adaptation import FINETUNE
+
+    return options.updates or (LOG_UPDATES if options.log else FINETUNE.updates)
+
+
 def _metrics(options, policy, adaptation, validation):
     task, fit = policy.task, adaptation.fit
     metrics = {
         "system": options.vehicle or task.system.name,
+        "set": task.set,
         "target": _target_text(options),
         "metric": task.metric,
         "unit": task.unit,
         "samples": len(adaptation.transitions),
+        "updates": _updates(options),
         "seed": options.seed,
         **{name: evaluation.summary for name, evaluation in adaptation.evaluations.items()},
         "prediction": adaptation.prediction,
@@ -234,6 +252,9 @@ def _metrics(options, policy, adaptation, validation):
         learned = adaptation.residual.to("cpu")
         both = {"model": Dynamics(task.system), "model + residual": learned}
         metrics["validation"] = {name: prediction_report(dynamics, validation) for name, dynamics in both.items()}
+        if validation.context is not None:  # what the policy was tuned in
+            held = prediction_report(learned, validation, adaptation.transitions.context.mean(0))
+            metrics["validation"]["with context held"] = held
         metrics["validation"]["n"] = len(validation)
     return metrics
 
@@ -258,13 +279,16 @@ def _table(metrics):
         for name, text in NAMES.items()
         if (m := metrics.get(name))
     ]
-    flights = tabulate(rows, (metrics["target"], f"{metrics['metric']} [{metrics['unit']}]", "success", "N"), "simple")
-    parts = [flights]
-    for title, key in (("held-out transitions, one step", "prediction"), ("validation flights", "validation")):
+    flown_in = f", flown in {metrics['evaluated_in']}" if "evaluated_in" in metrics else ""
+    header = (metrics["target"] + flown_in, f"{metrics['metric']} [{metrics['unit']}]", "success", "N")
+    parts = [tabulate(rows, header, "simple")]
+    # Recorded transitions that were held out have also decided what the residual may keep.
+    one_step = "transitions held out of the fit" if "evaluated_in" in metrics else "unseen transitions"
+    for title, key in ((f"{one_step}, one step", "prediction"), ("validation flights", "validation")):
         if key in metrics:
-            before, after = metrics[key]["model"], metrics[key]["model + residual"]
-            rows = [(UNITS.get(name, name), before[name], after[name]) for name in before]
-            parts.append(tabulate(rows, (title, "model", "model + residual"), "simple", floatfmt=".3g"))
+            errors = {name: table for name, table in metrics[key].items() if name != "n"}
+            rows = [(UNITS.get(row, row), *(table[row] for table in errors.values())) for row in errors["model"]]
+            parts.append(tabulate(rows, (title, *errors), "simple", floatfmt=".3g"))
     spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in metrics["seconds"].items())
     parts.append(f"seconds ({metrics['threads']} thread{'s' * (metrics['threads'] > 1)}): {spent}")
     parts.extend(f"note: {warning}" for warning in metrics["residual"]["warnings"])

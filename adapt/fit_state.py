@@ -4,7 +4,7 @@ import torch
 
 from adapt.correction import normalise
 from adapt.correction import train as train_network
-from adapt.prediction import bound, predict, prediction_error
+from adapt.prediction import bound, prediction_error, same_sign
 
 
 def fit_state(residual, data, train, held, settings, generator):
@@ -15,7 +15,8 @@ def fit_state(residual, data, train, held, settings, generator):
     parts = []
     for part in (train, held):
         with torch.no_grad():
-            error = part.next_state - predict(residual, part)
+            predicted = bound(residual, part)(part.state, part.action)
+            error = same_sign(part.next_state, predicted, part) - predicted
         parts.append((bound(residual, part).inputs(part.state, part.action), error))
     (inputs, targets), (held_inputs, held_targets) = parts
     outputs = targets.square().mean(0).sqrt() > 1e-7

@@ -83,13 +83,14 @@ def _numbers(table, quantity, log):
 
 
 def _thrust(values, mapping, vehicle, log):
-    """Collective thrust per mass [m/s^2] (N,), from the log or from motor commands by the vehicle's thrust curve."""
+    """Collective thrust per mass that the controller believes in [m/s^2] (N,), logged or by the thrust curve."""
+    mass = vehicle.system.believed[0]
     if "thrust" in values:
         per_mass = mapping.quantities["thrust"].unit == "m/s^2"
-        return values["thrust"][:, 0] / (1.0 if per_mass else vehicle.system.mass)
+        return values["thrust"][:, 0] / (1.0 if per_mass else mass)
     if vehicle.motors is None:
         raise InputError(f"{log}: motor commands need a thrust_curve; vehicle {vehicle.name} has no [motors] table")
-    return vehicle.motors.force(values["motors"]).sum(1) / vehicle.system.mass
+    return vehicle.motors.force(values["motors"]).sum(1) / mass
 
 
 def rotation_matrices(quaternion):

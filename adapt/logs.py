@@ -4,7 +4,7 @@ read -> units and frames -> reject impossible rows -> cut the ground -> split in
 What a log lacks is stood in for: the thrust comes from motor commands, and body-rate commands, where they were not
 logged, are those that would have led the vehicle's rate loop to the measured mean rates.
 
-Context of a transition, all of it known when the period begins:
+Context of a transition, from what was logged up to 0.15 s before the period begins:
 
 | name                        | what                                                                           | unit  |
 |-----------------------------|--------------------------------------------------------------------------------|-------|

@@ -82,6 +82,7 @@ def main(options):
     config = configuration(options, system)
     task = make_task(system, options.set)
     dynamics = make_dynamics(system, options.target)
+    task.episodes(1, "train", options.seed)  # what can't be flown is told before anything is written
     folder = _folder(options, system)
     identity = _identity(options, task, config)
     banks = apg.training_banks(task, config, options.seed, device)
@@ -92,7 +93,7 @@ def main(options):
         **command.environment(options.seed, options.threads),
     }
     if options.resume:
-        run.load_state_dict(_saved(folder, identity), banks, config, task)
+        _restore(run, folder, identity, banks, config, task)
     command.write_json(folder / "config.json", report)
     torch.manual_seed(options.seed)
     _train(run, dynamics, task, banks, config, options, folder, identity)
@@ -129,18 +130,24 @@ def _identity(options, task, config):
     return {**robot, "set": task.set, "seed": options.seed, **asdict(config)}
 
 
-def _saved(folder, identity):
+def _restore(run, folder, identity, banks, config, task):
+    """Continue from training.pt, which must be of the same run and whole."""
     import torch
 
     path = folder / "training.pt"
+    damaged = InputError(f"--resume: {path} is damaged or not of this command; start again without --resume")
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
         then = saved["identity"]
+        changed = [key for key, value in identity.items() if then[key] != value]
     except Exception:  # torch raises many kinds; weights_only refuses whatever is more than tensors
-        raise InputError(f"--resume: {path} is damaged or not of this command; start again without --resume") from None
-    if changed := [key for key, value in identity.items() if then.get(key) != value]:
+        raise damaged from None
+    if changed:
         raise InputError(f"--resume: {folder} was trained with another {', '.join(changed)}; give the same")
-    return saved
+    try:
+        run.load_state_dict(saved, banks, config, task)
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, RuntimeError):  # a part is missing or other
+        raise damaged from None
 
 
 def _train(run, dynamics, task, banks, config, options, folder, identity):
@@ -187,7 +194,7 @@ def _until_interrupted(run, updates, folder, identity):
             yield metrics
             if interrupted():
                 _save_training(run, folder, identity)
-                raise KeyboardInterrupt(f"continue with --resume --out {folder}")
+                raise KeyboardInterrupt(f"continue with the same options, --resume and --out {folder}")
 
 
 def validate(network, dynamics, task, n=100):

@@ -5,6 +5,7 @@ mean and standard deviation over seeds as Markdown.
 """
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -13,8 +14,9 @@ import tyro
 
 from adapt import command
 from envs.errors import InputError
-from policies.files import whole
+from policies.files import replacing
 
+GROUP = ("system", "set", "target", "samples", "residual", "updates")  # runs that differ in more are not averaged
 STAGES = ("source", "zero_shot", "few_shot", "oracle")
 
 
@@ -22,23 +24,51 @@ STAGES = ("source", "zero_shot", "few_shot", "oracle")
 class Options:
     """Collect the results of several runs into a CSV and a Markdown table with mean and spread over seeds."""
 
-    runs: Annotated[tuple[str, ...], tyro.conf.Positional]
+    runs: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Folders of adapt.fewshot, or JSON files of adapt.evaluate."""
     csv: str | None = None
     """File for one row per run."""
+    overwrite: bool = False
+    """Replace that file."""
 
 
 def main(options):
     """Read, write the CSV, print the table."""
     import pandas as pd
 
+    _check(options)
     table = pd.DataFrame([_row(Path(run)) for run in options.runs])
-    keys = [key for key in ("system", "set", "target", "samples") if key in table]
+    keys = [key for key in GROUP if key in table]
+    _refuse_repeated(table[[*keys, "seed"]], options.runs)
     table = table.sort_values([*keys, "seed"], ignore_index=True)
     if options.csv:
-        with whole(options.csv) as partial:
+        with replacing(options.csv) as partial:
             table.to_csv(partial, index=False)
     print(summary(table, keys).to_markdown(index=False))
+
+
+def _check(options):
+    if not options.runs:
+        raise InputError("no runs: name folders of adapt.fewshot, or JSON files of adapt.evaluate")
+    if options.csv is None:
+        return
+    path = Path(options.csv)
+    if path.is_dir():
+        raise InputError(f"--csv {path}: is a folder, expected a file name such as {path / 'runs.csv'}")
+    if path.exists() and not options.overwrite:
+        raise InputError(f"--csv {path}: exists; name another file or add --overwrite")
+    if not path.parent.is_dir():
+        raise InputError(f"--csv {path}: there is no folder {path.parent}")
+
+
+def _refuse_repeated(table, runs):
+    """Two runs of one group and seed are one result, or differ in what the table doesn't show: no spread over seeds."""
+    seen = {}
+    for run, values in zip(runs, table.itertuples(index=False), strict=True):
+        same = tuple(map(str, values))  # text, as a missing value doesn't equal itself
+        if same in seen:
+            raise InputError(f"{seen[same]} and {run}: are of one group and have the same seed; leave one out")
+        seen[same] = run
 
 
 def summary(table, keys):
@@ -56,7 +86,8 @@ def summary(table, keys):
             if name in runs and runs[name].notna().all():
                 line[name] = _spread(runs[name], 3 if "/" in name else 1)
         lines.append(line)
-    return pd.DataFrame(lines).fillna("")
+    table = pd.DataFrame(lines).astype(object)
+    return table.where(table.notna(), "")
 
 
 def _spread(values, digits=4):
@@ -76,14 +107,22 @@ def _row(run):
 
 def _fewshot_row(path, metrics):
     row = {key: metrics[key] for key in ("system", "target", "samples", "seed", "metric", "unit")}
+    row |= {key: metrics[key] for key in ("set", "updates") if key in metrics}  # older files don't have them
+    row |= {"residual": metrics["residual"]["kind"]} if metrics.get("residual") else {}
     for stage in STAGES:
         if stage in metrics:
-            row |= {f"{stage}_{key}": metrics[stage][key] for key in ("mean", "std", "success", "n")}
+            row |= _figures(stage, metrics[stage])
     if "oracle" in metrics:
-        row["few_shot/oracle"] = metrics["few_shot"]["mean"] / metrics["oracle"]["mean"]
+        row["few_shot/oracle"] = row["few_shot_mean"] / row["oracle_mean"]
     own = sum(seconds for name, seconds in metrics["seconds"].items() if name != "oracle")
     config = json.loads((path.parent / "config.json").read_text())
     return row | {"seconds": own, "threads": metrics["threads"], "torch": config["torch"], "commit": config["commit"]}
+
+
+def _figures(name, summary):
+    """Columns of one evaluation; null in the file is not a number: none succeeded."""
+    values = {key: summary[key] for key in ("mean", "std", "success", "n")}
+    return {f"{name}_{key}": math.nan if value is None else value for key, value in values.items()}
 
 
 def _evaluation_row(metrics):
@@ -94,7 +133,7 @@ def _evaluation_row(metrics):
         "policy": options["policy"] or "",
         "seed": metrics["policy_info"]["seed"],
     }
-    row |= {f"error_{key}": metrics[key] for key in ("mean", "std", "success", "n")}
+    row |= _figures("error", metrics)
     keys = ("metric", "unit", "median_ms", "p99_ms", "threads", "torch", "commit")
     return row | {key: metrics[key] for key in keys}
 

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 
 from envs import rigid_body
+from envs.errors import InputError
 from envs.quadrotor import attitude
 from envs.references import split_generator
 from envs.system import Axis, System, Task
@@ -120,6 +121,11 @@ class FixedWing(System):
     side: tuple[float, ...] = (-0.033, -0.1, 0.039, 0.0, 0.225)  # [-] of beta, p, r, aileron, rudder
     roll: tuple[float, ...] = (-0.081, -0.529, 0.159, -0.453, 0.005)
     yaw: tuple[float, ...] = (0.189, -0.083, -0.948, -0.041, -0.077)
+
+    def __post_init__(self):
+        System.__post_init__(self)
+        if not self.inertia_xz * self.inertia_xz < self.inertia_x * self.inertia_z:
+            raise InputError(f"fixed_wing: inertia_xz is {self.inertia_xz:g}, too large for inertia_x and inertia_z")
 
     def derivative(self, x, u):
         velocity, rates = (x.u_b, x.v_b, x.w_b), (x.p, x.q, x.r)

@@ -129,20 +129,25 @@ class Quadrotor(System):
         return replace(self, controller_mass=mass, **beliefs)
 
     @property
+    def thrust_share(self):
+        """Delivered over commanded thrust per mass [-]: losses, and a mass that the controller is wrong about."""
+        return (1 - self.thrust_loss) * self.believed[0] / self.mass
+
+    @property
     def trim_action(self):
         middle, half = (self.thrust_max + self.thrust_min) / 2, (self.thrust_max - self.thrust_min) / 2
-        return Action((self.gravity - middle) / half, 0.0, 0.0, 0.0)
+        return Action((self.gravity / self.thrust_share - middle) / half, 0.0, 0.0, 0.0)
 
     @property
     def flight_limits(self):
         """The limits that a reference must respect."""
         rates = (self.rate_limit_x, self.rate_limit_y, self.rate_limit_z)
-        return FlightLimits(self.gravity, self.thrust_min, self.thrust_max, *rates)
+        thrusts = (self.thrust_share * self.thrust_min, self.thrust_share * self.thrust_max)
+        return FlightLimits(self.gravity, *thrusts, *rates)
 
     def derivative(self, x, u):
-        mass, _ = self.believed
         thrust = (self.thrust_max + self.thrust_min) / 2 + (self.thrust_max - self.thrust_min) / 2 * u.thrust
-        thrust = thrust * ((1 - self.thrust_loss) * mass / self.mass)
+        thrust = thrust * self.thrust_share
         up = rigid_body.axis_z(attitude(x))
         return State(
             *(x.vx, x.vy, x.vz),

@@ -44,12 +44,18 @@ class APGConfig:
     def __post_init__(self):
         for name in ("updates", "batch", "width", "learning_rate", "clip", "episodes"):
             if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"--{name.replace('_', '-')} {getattr(self, name)}: expected more than 0")
+                raise InputError(f"{_called(name)} {getattr(self, name)}: expected more than 0")
         for name in ("final_rate", "warmup", "curriculum", "exploration"):
             if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"--{name.replace('_', '-')} {getattr(self, name)}: expected between 0 and 1")
+                raise InputError(f"{_called(name)} {getattr(self, name)}: expected between 0 and 1")
         if self.optimizer not in OPTIMIZERS:
-            raise InputError(f"optimizer {self.optimizer!r}: expected one of {', '.join(OPTIMIZERS)}")
+            raise InputError(f"{_called('optimizer')} {self.optimizer!r}: expected one of {', '.join(OPTIMIZERS)}")
+
+
+def _called(name):
+    """A setting as the user gave it: an option of the commands, or a field where there is none."""
+    options = ("updates", "batch", "width", "learning_rate", "curriculum", "exploration")
+    return f"--{name.replace('_', '-')}" if name in options else f"APGConfig.{name}"
 
 
 PRESETS = {

@@ -11,6 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from envs.env import TrackingEnv
 
+WARM_UP = 20  # calls that are not timed: the first ones set things up
 TEST_EPISODES = {"cartpole": 50, "quadrotor": 50, "fixed_wing": 30}  # as many as the published tables use
 
 
@@ -69,18 +70,19 @@ def test_episodes(task, n=None, split="test", seed=0):
 
 
 def action_time(actor, task, calls=300):
-    """Median and 99th percentile [ms] of one action at batch 1 on one thread, observation included."""
+    """Median and 99th percentile [ms] of one action at batch 1 on one thread, observation included, after a warm-up."""
     episodes, step = task.episodes(1, "validation", 0), torch.zeros(1, dtype=torch.long)
     state = task.start(episodes, step)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     seconds = []
     with torch.no_grad():
-        for _ in range(calls):
+        for _ in range(WARM_UP + calls):
             begin = time.perf_counter()
             reference = task.reference(episodes, step, state)
             seen = {"observation": task.observe(state), "window": task.window(state, reference), "state": state}
             actor(TensorDict(seen, batch_size=(1,)))
             seconds.append(time.perf_counter() - begin)
     torch.set_num_threads(threads)
+    seconds = seconds[WARM_UP:]
     return {"median_ms": 1e3 * float(np.median(seconds)), "p99_ms": 1e3 * float(np.quantile(seconds, 0.99))}

@@ -92,6 +92,13 @@ def test_a_full_or_forbidden_disk_is_one_line_and_status_2(capsys, monkeypatch, 
     assert lines == [f"try: runs/a.json: {os.strerror(number)}; nothing half-written is kept"]
 
 
+@pytest.mark.parametrize("number", [errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EISDIR, errno.EIO])
+def test_whatever_goes_wrong_with_a_named_file_is_one_line_and_status_2(capsys, monkeypatch, number):
+    status, lines = ending(raising(OSError(number, os.strerror(number), "a.json")), capsys, monkeypatch)
+    assert status == 2
+    assert lines == [f"try: a.json: {os.strerror(number)}; nothing half-written is kept"]
+
+
 @pytest.mark.parametrize("error", [OSError(errno.EIO, "broken"), ValueError("a bug"), ZeroDivisionError()])
 def test_what_is_not_the_users_fault_keeps_its_traceback(capsys, monkeypatch, error):
     with pytest.raises(type(error)):
@@ -214,9 +221,9 @@ def test_a_vehicle_is_its_system_and_must_be_of_the_named_kind():
 
 def test_where_no_policy_ships_the_command_that_makes_one_is_named(monkeypatch):
     monkeypatch.setattr("policies.checkpoints.pretrained", lambda name: None)
-    with pytest.raises(InputError, match=r"none ships for crazyflie; .*adapt\.pretrain --vehicle crazyflie"):
+    with pytest.raises(InputError, match=r"none ships for crazyflie; .*adapt\.pretrain and the same --vehicle"):
         command.pick_policy(None, *command.pick_robot("quadrotor", "crazyflie"))
-    with pytest.raises(InputError, match=r"none ships for cartpole; .*adapt\.pretrain --system cartpole"):
+    with pytest.raises(InputError, match=r"none ships for cartpole; .*adapt\.pretrain and the same --system"):
         command.pick_policy(None, *command.pick_robot("cartpole", None))
 
 

@@ -82,8 +82,9 @@ def test_it_leaves_everything_that_it_promises_and_nothing_else(finished):
 def test_the_metrics_have_the_keys_that_others_read(finished):
     metrics = read(finished[0])
     assert LISTED | {"oracle"} <= metrics.keys()
-    said = ("quadrotor", "drag=0.3", "mean position error", "m", 100, 0)
-    assert tuple(metrics[key] for key in ("system", "target", "metric", "unit", "samples", "seed")) == said
+    said = ("quadrotor", "drag=0.3", "mean position error", "m", 100, 0, "paper", 5)
+    keys = ("system", "target", "metric", "unit", "samples", "seed", "set", "updates")
+    assert tuple(metrics[key] for key in keys) == said
     for name in ("source", "zero_shot", "few_shot", "oracle"):
         assert set(metrics[name]) == {"mean", "std", "success", "n"}
         assert metrics[name]["n"] == 50
@@ -102,7 +103,7 @@ def test_the_table_says_what_the_metrics_say(finished):
         assert f"{m['mean']:.4f} ± {m['std']:.4f}" in line
         assert float(line.split()[-2]) == round(m["success"], 2)
         assert int(line.split()[-1]) == m["n"]
-    assert "held-out transitions" in printed
+    assert "unseen transitions, one step" in printed
     assert "seconds (1 thread)" in printed
 
 
@@ -239,6 +240,60 @@ def test_bad_options_are_refused_before_anything_is_written(refused, cart, tmp_p
 def test_bad_options_of_a_quadrotor_are_refused_too(refused, quick, tmp_path, options, words):
     assert words in refused("fewshot", *quick, "--out", tmp_path / "run", *options)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("content", [None, "t,x,y,z\n0,0,0,1\n", "t,x,y\n0,0,0\n5,1,1\n"])
+def test_waypoints_that_can_not_be_flown_are_refused_before_anything_is_lost(
+    refused, quick, tmp_path, contents, content
+):
+    path, folder = tmp_path / "path.csv", tmp_path / "run"
+    if content:
+        path.write_text(content)
+    assert "path.csv" in refused("fewshot", *quick, "--set", path, "--out", folder)
+    assert not folder.exists()
+    folder.mkdir()
+    (folder / "metrics.json").write_text("old")
+    refused("fewshot", *quick, "--set", path, "--out", folder, "--overwrite")
+    assert contents(folder) == {"metrics.json": b"old"}
+
+
+def hover_log(path, seconds):
+    """A log of a Crazyflie that stands still in the air."""
+    columns = "t,px,py,pz,qw,qx,qy,qz,vx,vy,vz,p,q,r,motor1,motor2,motor3,motor4,vbat"
+    rows = [f"{k / 100},0,0,1,1,0,0,0,0,0,0,0,0,0,35000,35000,35000,35000,3.7" for k in range(round(100 * seconds))]
+    path.write_text("\n".join((columns, *rows)) + "\n")
+    return path
+
+
+def test_validation_flights_must_be_others_than_those_learned_from(refused, quick, tmp_path):
+    log, other = hover_log(tmp_path / "a.csv", 3), hover_log(tmp_path / "b.csv", 3)
+    given = ("--vehicle", "crazyflie", "--log", other, "--log", log, "--out", tmp_path / "run")
+    again = tmp_path / "folder" / ".." / "a.csv"
+    line = refused("fewshot", *quick, *given, "--validate", again)
+    assert f"--validate {again}: is learned from" in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_validation_flights_that_are_too_short_are_told_before_the_work(refused, tmp_path, monkeypatch):
+    monkeypatch.setattr("adapt.adaptation.adapt", ctrl_c)
+    log, short = hover_log(tmp_path / "a.csv", 4), hover_log(tmp_path / "b.csv", 1)
+    given = ("--vehicle", "crazyflie", "--log", log, "--validate", short, "--out", tmp_path / "run")
+    assert "lasts 1 s" in refused("fewshot", *given)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_table_says_where_was_flown_if_not_in_the_target(finished):
+    metrics = read(finished[0])
+    assert "flown in" not in fewshot._table(metrics)
+    header = fewshot._table({**metrics, "target": "a.csv", "evaluated_in": "model + residual"}).split("\n")[2]
+    assert header.startswith("a.csv, flown in model + residual ")
+
+
+def test_what_an_earlier_run_drew_does_not_stay(call, cart, tmp_path):
+    for name in fewshot.PICTURES:
+        (tmp_path / name).write_text("old")
+    assert call("fewshot", *cart, "--out", tmp_path, "--overwrite").status == 0
+    assert {path.name for path in tmp_path.iterdir()} == FILES
 
 
 def test_an_oracle_needs_a_target(refused, finished, quick, tmp_path):
@@ -404,4 +459,5 @@ def test_pictures_and_a_video_come_with_it(call, cart, tmp_path):
     assert {"flight.png", "error.png", "residual.png", "training.png", "flight.mp4"} <= {
         p.name for p in tmp_path.iterdir()
     }
+    assert {path.name for path in tmp_path.iterdir()} == {*fewshot.RESULTS, *fewshot.PICTURES}
     assert all(path.stat().st_size > 1000 for path in tmp_path.iterdir() if path.suffix in (".png", ".mp4"))

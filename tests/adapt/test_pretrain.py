@@ -125,7 +125,7 @@ def test_ctrl_c_within_an_update_and_resume_end_where_an_uninterrupted_run_does(
         patch.setattr(apg, "learning_rate", pressed)
         answer = call("pretrain", *TINY, "--out", broken)
     assert answer.status == 130
-    assert answer.errors == [f"pretrain: interrupted; continue with --resume --out {broken}"]
+    assert answer.errors == [f"pretrain: interrupted; continue with the same options, --resume and --out {broken}"]
     assert trained_weights(broken)[2] == update + 1
     assert {path.name for path in broken.iterdir()} <= FILES
     assert call("pretrain", *TINY, "--out", broken, "--resume").status == 0
@@ -179,6 +179,32 @@ def test_there_must_be_something_to_resume(refused, tmp_path):
 def test_a_damaged_state_is_refused(refused, tmp_path, content):
     (tmp_path / "training.pt").write_bytes(content)
     assert "training.pt is damaged" in refused("pretrain", *TINY, "--resume", "--out", tmp_path)
+
+
+@pytest.mark.parametrize("missing", ["identity", "seed", "network", "flight", "everything", "a dictionary"])
+def test_a_state_that_lacks_something_is_refused(call, refused, tmp_path, missing):
+    run = ("pretrain", *TINY, "--updates", 4, "--out", tmp_path)
+    assert call(*run).status == 0
+    saved = torch.load(tmp_path / "training.pt", weights_only=True)
+    spoilt = {
+        "identity": {**saved, "identity": "cartpole"},
+        "seed": {**saved, "identity": {key: value for key, value in saved["identity"].items() if key != "seed"}},
+        "network": {key: value for key, value in saved.items() if key != "network"},
+        "flight": {**saved, "flight": None},
+        "everything": {},
+        "a dictionary": [1, 2],
+    }
+    torch.save(spoilt[missing], tmp_path / "training.pt")
+    assert "training.pt is damaged or not of this command" in refused(*run, "--resume")
+
+
+def test_waypoints_that_can_not_be_read_are_refused_before_anything_is_lost(refused, tmp_path, contents):
+    options = ("--system", "quadrotor", "--updates", 1, "--batch", 4, "--width", 8, "--set", tmp_path / "nope.csv")
+    assert "nope.csv" in refused("pretrain", *options, "--out", tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "policy.safetensors").write_text("old")
+    refused("pretrain", *options, "--out", tmp_path, "--overwrite")
+    assert contents(tmp_path) == {"policy.safetensors": b"old"}
 
 
 def test_a_state_that_holds_code_is_refused_and_the_code_does_not_run(refused, tmp_path):

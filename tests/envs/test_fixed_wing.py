@@ -8,6 +8,7 @@ import torch
 from torch.autograd.functional import jacobian, jvp
 
 from envs import Dynamics, make_dynamics, rigid_body
+from envs.errors import InputError
 from envs.fixed_wing import CRUISE, FixedWing, limited
 
 # In a mirror y, roll, yaw, v_b, p and r change sign, and so do aileron and rudder.
@@ -208,3 +209,8 @@ def test_beyond_the_incidence_limit_lift_grows_no_more(fixed_wing, scalars, degr
     coefficient = lift / (fixed_wing.air_density / 2 * CRUISE**2 * fixed_wing.wing_area)
     most = fixed_wing.lift[0] + fixed_wing.lift[1] * fixed_wing.incidence_limit
     assert 0.7 * most < coefficient.item() < most
+
+
+def test_a_product_of_inertia_that_no_body_has_is_refused():
+    with pytest.raises(InputError, match=r"inertia_xz is 0\.5, too large"):
+        replace(FixedWing(), inertia_xz=0.5)

@@ -37,7 +37,16 @@ def test_the_trim_action_hovers(quadrotor):
     assert trim(quadrotor)[1:].tolist() == [0, 0, 0]
 
 
-@pytest.mark.parametrize("change", [{"mass": 0.034}, {"thrust_min": 0.0, "thrust_max": 30.0}, {"gravity": 3.7}])
+OWN = (
+    {"mass": 0.034},
+    {"thrust_min": 0.0, "thrust_max": 30.0},
+    {"gravity": 3.7},
+    {"thrust_loss": 0.2},
+    {"controller_mass": 0.6},
+)
+
+
+@pytest.mark.parametrize("change", OWN, ids=str)
 def test_a_quadrotor_of_ones_own_hovers(change):
     assert hovers(replace(Quadrotor(), **change))
 

@@ -392,9 +392,13 @@ def test_every_system_has_tuned_settings():
         ("curriculum", 1.5, "--curriculum 1.5: expected between 0 and 1"),
         ("exploration", -0.1, "--exploration -0.1: expected between 0 and 1"),
         ("exploration", float("nan"), "--exploration nan: expected between 0 and 1"),
-        ("optimizer", "lbfgs", "optimizer 'lbfgs': expected one of adam, sgd"),
+        ("clip", 0.0, "APGConfig.clip 0.0: expected more than 0"),
+        ("episodes", 0, "APGConfig.episodes 0: expected more than 0"),
+        ("warmup", 2.0, "APGConfig.warmup 2.0: expected between 0 and 1"),
+        ("final_rate", -1.0, "APGConfig.final_rate -1.0: expected between 0 and 1"),
+        ("optimizer", "lbfgs", "APGConfig.optimizer 'lbfgs': expected one of adam, sgd"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused_by_name(field, value, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match="^" + message):
         apg.APGConfig(**{field: value})

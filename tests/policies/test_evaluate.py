@@ -1,6 +1,7 @@
 """The closed-loop evaluation: controllers whose result is known on paper, and independence of everything else."""
 
 import math
+import time
 
 import pandas as pd
 import pytest
@@ -196,6 +197,21 @@ def test_the_seed_draws_other_episodes(name):
     task = make_task(name)
     assert torch.equal(evaluation.test_episodes(task, 5, seed=1), evaluation.test_episodes(task, 5, seed=1))
     assert not torch.equal(evaluation.test_episodes(task, 5), evaluation.test_episodes(task, 5, seed=1))
+
+
+def test_the_first_calls_warm_up_and_are_not_timed():
+    task, calls = make_task("cartpole"), []
+    actor = as_actor(network_for(task))
+
+    def slow_at_first(tensordict):
+        calls.append(None)
+        if len(calls) <= 20:
+            time.sleep(0.05)
+        return actor(tensordict)
+
+    spent = action_time(slow_at_first, task, calls=9)
+    assert len(calls) == 29
+    assert spent["median_ms"] < 50
 
 
 def test_the_time_of_an_action_is_taken_on_one_thread_which_is_undone(name):
