@@ -291,8 +291,20 @@ def _table(metrics):
             parts.append(tabulate(rows, (title, *errors), "simple", floatfmt=".3g"))
     spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in metrics["seconds"].items())
     parts.append(f"seconds ({metrics['threads']} thread{'s' * (metrics['threads'] > 1)}): {spent}")
-    parts.extend(f"note: {warning}" for warning in metrics["residual"]["warnings"])
+    parts.extend(f"note: {note}" for note in (*_notes(metrics), *metrics["residual"]["warnings"]))
     return "\n\n" + "\n\n".join(parts) + "\n"
+
+
+def _notes(metrics):
+    """What a user should not overlook in the numbers."""
+    source, before, after = (metrics[name] for name in ("source", "zero_shot", "few_shot"))
+    if not source["success"]:
+        return ["no flight succeeded even in the model; can this reference be flown by this robot?"]
+    if (after["success"], -after["mean"]) < (before["success"], -before["mean"]):
+        return [
+            "the adapted policy is worse than the old one here; keep the old one, or try more --updates or --samples"
+        ]
+    return []
 
 
 UNITS = {

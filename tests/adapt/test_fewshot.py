@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import math
 import resource
 import signal
 import subprocess
@@ -461,3 +462,20 @@ def test_pictures_and_a_video_come_with_it(call, cart, tmp_path):
     }
     assert {path.name for path in tmp_path.iterdir()} == {*fewshot.RESULTS, *fewshot.PICTURES}
     assert all(path.stat().st_size > 1000 for path in tmp_path.iterdir() if path.suffix in (".png", ".mp4"))
+
+
+@pytest.mark.parametrize(
+    ("source", "before", "after", "said"),
+    [
+        ((1.0, 0.1), (1.0, 0.2), (1.0, 0.1), None),
+        ((1.0, 0.1), (1.0, 0.2), (1.0, 0.3), "worse than the old one"),
+        ((1.0, 0.1), (1.0, 0.2), (0.9, 0.1), "worse than the old one"),
+        ((0.0, math.nan), (0.0, math.nan), (0.0, math.nan), "no flight succeeded even in the model"),
+    ],
+)
+def test_a_result_that_should_not_be_overlooked_is_told(source, before, after, said):
+    names = ("source", "zero_shot", "few_shot")
+    pairs = zip(names, (source, before, after), strict=True)
+    notes = fewshot._notes({name: {"success": success, "mean": mean} for name, (success, mean) in pairs})
+    assert len(notes) == (said is not None)
+    assert all(said in note for note in notes)
