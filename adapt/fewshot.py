@@ -10,14 +10,13 @@ from typing import Annotated
 
 import tyro
 
-from adapt import command
+from adapt import command, report
 from envs.errors import InputError
 
 RESULTS = ("config.json", "metrics.json", "policy.safetensors", "residual.safetensors", "transitions.csv")
 PICTURES = ("flight.png", "error.png", "residual.png", "training.png", "flight.mp4")
 DEFAULT_TARGET = ("drag=0.3",)
 LOG_UPDATES = 600
-NAMES = {"source": "source", "zero_shot": "zero-shot", "few_shot": "few-shot", "oracle": "oracle"}
 Repeatable = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 
@@ -85,7 +84,7 @@ def main(options):
     adaptation = _adapt(options, setting, policy, recorded, folder, device)
     metrics = _metrics(options, policy, adaptation, validation)
     command.write_json(folder / "metrics.json", metrics)
-    print(_table(metrics))
+    print(report.table(metrics))
     _pictures(options, adaptation, folder)
     print(f"results in {folder}/: metrics.json, policy.safetensors, residual.safetensors, transitions.csv, pictures")
 
@@ -187,8 +186,8 @@ def _adapt(options, setting, policy, recorded, folder, device):
     from adapt.adaptation import FINETUNE, adapt
     from policies.checkpoints import save_policy
 
-    report = {"options": asdict(options), **command.environment(options.seed, options.threads)}
-    command.write_json(folder / "config.json", report)
+    settings = {"options": asdict(options), **command.environment(options.seed, options.threads)}
+    command.write_json(folder / "config.json", settings)
 
     def keep(name, result):
         if name == "transitions":
@@ -269,54 +268,6 @@ def _target_text(options):
         first, *more = options.log or (options.transitions,)
         return Path(first).name + (f" and {len(more)} more" if more else "")
     return " ".join(options.target or DEFAULT_TARGET)
-
-
-def _table(metrics):
-    from tabulate import tabulate
-
-    rows = [
-        (text, f"{m['mean']:.4f} ± {m['std']:.4f}" if m["success"] else "none succeeded", f"{m['success']:.2f}", m["n"])
-        for name, text in NAMES.items()
-        if (m := metrics.get(name))
-    ]
-    flown_in = f", flown in {metrics['evaluated_in']}" if "evaluated_in" in metrics else ""
-    header = (metrics["target"] + flown_in, f"{metrics['metric']} [{metrics['unit']}]", "success", "N")
-    parts = [tabulate(rows, header, "simple")]
-    # Recorded transitions that were held out have also decided what the residual may keep.
-    one_step = "transitions held out of the fit" if "evaluated_in" in metrics else "unseen transitions"
-    for title, key in ((f"{one_step}, one step", "prediction"), ("validation flights", "validation")):
-        if key in metrics:
-            errors = {name: table for name, table in metrics[key].items() if name != "n"}
-            rows = [(UNITS.get(row, row), *(table[row] for table in errors.values())) for row in errors["model"]]
-            parts.append(tabulate(rows, (title, *errors), "simple", floatfmt=".3g"))
-    spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in metrics["seconds"].items())
-    parts.append(f"seconds ({metrics['threads']} thread{'s' * (metrics['threads'] > 1)}): {spent}")
-    parts.extend(f"note: {note}" for note in (*_notes(metrics), *metrics["residual"]["warnings"]))
-    return "\n\n" + "\n\n".join(parts) + "\n"
-
-
-def _notes(metrics):
-    """What a user should not overlook in the numbers."""
-    source, before, after = (metrics[name] for name in ("source", "zero_shot", "few_shot"))
-    if not source["success"]:
-        return ["no flight succeeded even in the model; can this reference be flown by this robot?"]
-    if (after["success"], -after["mean"]) < (before["success"], -before["mean"]):
-        return [
-            "the adapted policy is worse than the old one here; keep the old one, or try more --updates or --samples"
-        ]
-    return []
-
-
-UNITS = {
-    "position": "position [m]",
-    "velocity": "velocity [m/s]",
-    "attitude": "attitude [-]",
-    "rates": "body rates [rad/s]",
-    "acceleration": "acceleration [m/s^2]",
-    "angular_acceleration": "angular acceleration [rad/s^2]",
-    "position_1s": "position after 1 s [m]",
-    "velocity_1s": "velocity after 1 s [m/s]",
-}
 
 
 def _pictures(options, adaptation, folder):

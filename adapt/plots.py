@@ -16,13 +16,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from adapt.prediction import GROUPS, predict
+from adapt.report import NAMES
 from envs.system import Axis
 from policies.files import whole
 
 DPI = 150
 GREY, LIGHT = "#595959", "#BDBDBD"
 COLOURS = {"source": GREY, "zero_shot": "#D55E00", "few_shot": "#0072B2", "oracle": "#009E73"}
-NAMES = {"source": "source", "zero_shot": "zero-shot", "few_shot": "few-shot", "oracle": "oracle"}
 STYLE = {
     "font.size": 13,
     "axes.titlesize": 14,

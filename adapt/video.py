@@ -13,6 +13,7 @@ import torch
 
 from adapt import plots
 from adapt.plots import COLOURS, GREY, LIGHT
+from adapt.report import NAMES
 from envs.dynamics import TORCH
 from envs.errors import InputError
 from policies.files import whole
@@ -118,7 +119,7 @@ def _flight(adaptation, name, row, times):
     trail = np.array([_floats(task.system.place(_scalars(task.system, state))) for state in states])
     error = _at(torch.as_tensor(plots.traces(task, evaluation)[row]).nan_to_num(), steps).numpy()
     factor, unit = plots.small([error.max()], task.trace_unit)
-    title = f"{plots.NAMES[name]}, mean of all: {plots.score(evaluation, plots.score_scale(adaptation))}"
+    title = f"{NAMES[name]}, mean of all: {plots.score(evaluation, plots.score_scale(adaptation))}"
     errors = [f"{task.trace_name} {plots.number(value)} {unit}" for value in factor * error]
     return Flight(title, _colour(COLOURS[name]), states, trail, errors)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from adapt import command, fewshot
+from adapt import command, fewshot, report
 from adapt.residual_kinds import load_residual
 from adapt.transitions import Transitions
 from envs import make_dynamics, make_system
@@ -285,8 +285,8 @@ def test_validation_flights_that_are_too_short_are_told_before_the_work(refused,
 
 def test_the_table_says_where_was_flown_if_not_in_the_target(finished):
     metrics = read(finished[0])
-    assert "flown in" not in fewshot._table(metrics)
-    header = fewshot._table({**metrics, "target": "a.csv", "evaluated_in": "model + residual"}).split("\n")[2]
+    assert "flown in" not in report.table(metrics)
+    header = report.table({**metrics, "target": "a.csv", "evaluated_in": "model + residual"}).split("\n")[2]
     assert header.startswith("a.csv, flown in model + residual ")
 
 
@@ -476,6 +476,6 @@ def test_pictures_and_a_video_come_with_it(call, cart, tmp_path):
 def test_a_result_that_should_not_be_overlooked_is_told(source, before, after, said):
     names = ("source", "zero_shot", "few_shot")
     pairs = zip(names, (source, before, after), strict=True)
-    notes = fewshot._notes({name: {"success": success, "mean": mean} for name, (success, mean) in pairs})
+    notes = report.notes({name: {"success": success, "mean": mean} for name, (success, mean) in pairs})
     assert len(notes) == (said is not None)
     assert all(said in note for note in notes)

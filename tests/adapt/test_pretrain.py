@@ -374,7 +374,7 @@ def test_as_a_process_ctrl_c_ends_with_130_and_what_it_promised(tmp_path, stderr
     run.send_signal(signal.SIGINT)
     errors = stderr_lines(run.communicate(timeout=60)[1].decode())
     assert run.returncode == 130
-    assert errors == [f"pretrain: interrupted; continue with --resume --out {tmp_path}"]
+    assert errors == [f"pretrain: interrupted; continue with the same options, --resume and --out {tmp_path}"]
     assert {path.name for path in tmp_path.iterdir() if path.is_file()} == FILES
     assert load_policy(tmp_path / "policy.safetensors")
     assert torch.load(tmp_path / "training.pt", weights_only=True)["update"] >= 10

@@ -1,0 +1,50 @@
+"""What `adapt.fewshot` prints: its metrics as tables, and what a user should not overlook in them."""
+
+NAMES = {"source": "source", "zero_shot": "zero-shot", "few_shot": "few-shot", "oracle": "oracle"}
+UNITS = {
+    "position": "position [m]",
+    "velocity": "velocity [m/s]",
+    "attitude": "attitude [-]",
+    "rates": "body rates [rad/s]",
+    "acceleration": "acceleration [m/s^2]",
+    "angular_acceleration": "angular acceleration [rad/s^2]",
+    "position_1s": "position after 1 s [m]",
+    "velocity_1s": "velocity after 1 s [m/s]",
+}
+
+
+def table(metrics):
+    """The tables of a run of `adapt.fewshot` as text: flights, predictions, seconds, notes."""
+    from tabulate import tabulate
+
+    rows = [
+        (text, f"{m['mean']:.4f} ± {m['std']:.4f}" if m["success"] else "none succeeded", f"{m['success']:.2f}", m["n"])
+        for name, text in NAMES.items()
+        if (m := metrics.get(name))
+    ]
+    flown_in = f", flown in {metrics['evaluated_in']}" if "evaluated_in" in metrics else ""
+    header = (metrics["target"] + flown_in, f"{metrics['metric']} [{metrics['unit']}]", "success", "N")
+    parts = [tabulate(rows, header, "simple")]
+    # Recorded transitions that were held out have also decided what the residual may keep.
+    one_step = "transitions held out of the fit" if "evaluated_in" in metrics else "unseen transitions"
+    for title, key in ((f"{one_step}, one step", "prediction"), ("validation flights", "validation")):
+        if key in metrics:
+            errors = {name: table for name, table in metrics[key].items() if name != "n"}
+            rows = [(UNITS.get(row, row), *(table[row] for table in errors.values())) for row in errors["model"]]
+            parts.append(tabulate(rows, (title, *errors), "simple", floatfmt=".3g"))
+    spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in metrics["seconds"].items())
+    parts.append(f"seconds ({metrics['threads']} thread{'s' * (metrics['threads'] > 1)}): {spent}")
+    parts.extend(f"note: {note}" for note in (*notes(metrics), *metrics["residual"]["warnings"]))
+    return "\n\n" + "\n\n".join(parts) + "\n"
+
+
+def notes(metrics):
+    """What a user should not overlook in the numbers."""
+    source, before, after = (metrics[name] for name in ("source", "zero_shot", "few_shot"))
+    if not source["success"]:
+        return ["no flight succeeded even in the model; can this reference be flown by this robot?"]
+    if (after["success"], -after["mean"]) < (before["success"], -before["mean"]):
+        return [
+            "the adapted policy is worse than the old one here; keep the old one, or try more --updates or --samples"
+        ]
+    return []
