@@ -121,6 +121,7 @@ def _check_system(path, trained_for, wanted):
 
 
 def _check_contract(path, config, task):
+    task = replace(task, set=task.sets[0])  # sizes are those of any set, and a file of waypoints may have gone
     episodes, step = task.episodes(1, "train", 0), torch.zeros(1, dtype=torch.long)
     state = task.start(episodes, step)
     window = task.window(state, task.reference(episodes, step, state))

@@ -236,3 +236,13 @@ def test_shipped_policies_load_by_the_name_of_their_robot(name):
 
 def test_nothing_ships_under_a_name_that_is_none():
     assert pretrained("submarine") is None
+
+
+def test_a_checkpoint_loads_when_the_waypoints_it_was_flown_on_have_gone(tmp_path):
+    waypoints = tmp_path / "path.csv"
+    waypoints.write_text("t,x,y,z\n0,0,0,0\n10,3,2,1\n")
+    save_policy(
+        tmp_path / "p.safetensors", network_for(make_task("quadrotor")), make_task("quadrotor", str(waypoints)), {}
+    )
+    waypoints.unlink()
+    assert load_policy(tmp_path / "p.safetensors").task.set == str(waypoints)
