@@ -133,6 +133,7 @@ class Balance(Task):
     action_weights: ClassVar[dict[str, float]] = {}
     sets: ClassVar[tuple[str, ...]] = ("balance",)
     encoder: ClassVar[str] = "none"
+    layers: ClassVar[tuple[int, ...]] = (32, 64, 64, 32)
     thresholds: ClassVar[tuple[float, float]] = (0.05, 0.4)
     views: ClassVar[tuple[tuple[str, str], ...]] = (("t", "v"), ("t", "theta"))
     trace_name: ClassVar[str] = "cart speed"

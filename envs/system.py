@@ -120,6 +120,7 @@ class Task(ABC):
     sets: ClassVar[tuple[str, ...]]  # names of the families of episodes; the first is the default
     reads_waypoints: ClassVar[bool] = False  # whether `set` may name a CSV file
     encoder: ClassVar[str]  # how a policy reads the reference: "conv", "linear" or "none"
+    layers: ClassVar[tuple[int, ...]] = (64, 64, 64, 64)  # neurons of the policy's hidden layers in the paper
     thresholds: ClassVar[tuple[float, float]]  # first and last divergence threshold of the curriculum
     speeds: ClassVar[tuple[float, ...]] = (1.0,)  # speeds of the curriculum
     views: ClassVar[tuple[tuple[str, str], ...]] = ()  # pictures of a flight: pairs of states, or "t" and a state

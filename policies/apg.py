@@ -31,7 +31,7 @@ class APGConfig:
 
     updates: int = 3000
     batch: int = 256  # episodes flown side by side
-    width: int = 64  # neurons of every layer of the network
+    width: int | None = None  # neurons of every layer of the network; None: those of the paper
     learning_rate: float = 3e-3
     final_rate: float = 0.01  # [-] last learning rate as a share of the first
     warmup: float = 0.02  # [-] share of the updates in which the learning rate rises
@@ -43,7 +43,7 @@ class APGConfig:
 
     def __post_init__(self):
         for name in ("updates", "batch", "width", "learning_rate", "clip", "episodes"):
-            if not 0 < getattr(self, name) < math.inf:
+            if getattr(self, name) is not None and not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"{_called(name)} {getattr(self, name)}: expected more than 0")
         for name in ("final_rate", "warmup", "curriculum", "exploration"):
             if not 0 <= getattr(self, name) <= 1:
@@ -187,7 +187,7 @@ def begin(dynamics, task, banks, config, seed, network=None):
     if network is None:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            network = network_for(task, features=config.width, widths=(config.width,) * 3).to(banks[0].device)
+            network = network_for(task, config.width).to(banks[0].device)
         normalise(network, task, dynamics, banks[-1], generator)
     flight = Flight(task, dynamics, banks[0], config.batch, generator)
     return Training(network, OPTIMIZERS[config.optimizer](network.parameters()), flight, generator)

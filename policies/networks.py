@@ -84,8 +84,15 @@ class PlanNetwork(nn.Module):
             self.window_scale.copy_(torch.where(reach > 1e-3, reach, torch.ones_like(reach)))
 
 
-def network_for(task, **shape):
-    """A network of the size that a task needs; `shape` overrides `features`, `filters`, `widths`."""
+def network_for(task, width=None, **shape):
+    """A network of the size that a task needs.
+
+    Args:
+        width: neurons of every hidden layer; None takes those of the paper.
+        shape: overrides `features`, `filters`, `widths` of the `NetworkConfig`.
+    """
+    features, *widths = task.layers if width is None else (width,) * len(task.layers)
+    shape = {"features": features, "widths": tuple(widths), **shape}
     episodes = task.episodes(1, "train", 0)
     step = torch.zeros(1, dtype=torch.long)
     state = task.start(episodes, step)

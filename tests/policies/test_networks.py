@@ -62,6 +62,18 @@ def test_the_quadrotor_network_is_that_of_the_paper():
     assert sum(p.numel() for p in network.parameters()) == wanted
 
 
+def test_the_cartpole_network_is_that_of_the_paper():
+    """Layers of 32, 64, 64, 32 and 10 outputs."""
+    network = network_for(make_task("cartpole"))
+    wanted = 4 * 32 + 32 + 32 * 64 + 64 + 64 * 64 + 64 + 64 * 32 + 32 + 32 * 10 + 10
+    assert sum(p.numel() for p in network.parameters()) == wanted
+
+
+def test_a_width_is_that_of_every_hidden_layer():
+    config = network_for(make_task("cartpole"), width=16).config
+    assert (config.features, config.widths) == (16, (16, 16, 16))
+
+
 def test_the_filters_run_over_time():
     """The whole network, written out: feature (f, t) sees the points t, t + 1, t + 2 of the reference."""
     task = make_task("quadrotor")
