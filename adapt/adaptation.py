@@ -121,9 +121,9 @@ def adapt(
         held_out = collect(actor, TrackingEnv(target, task, unseen, device=device), HELD_OUT)
     if transitions.context is not None:
         context = transitions.context.mean(0) if context is None else torch.as_tensor(context)
-        held_out = held_out and replace(
-            held_out, context=context.expand(len(held_out), -1), context_names=transitions.context_names
-        )
+        if held_out is not None:
+            seen = context.expand(len(held_out), -1)
+            held_out = replace(held_out, context=seen, context_names=transitions.context_names)
     keep("transitions", transitions)
     clock.next("fit")
     residual, fit = residuals.fit_residual(transitions, source, kind, seed)

@@ -59,8 +59,10 @@ def _parse(name, options):
     raise InputError(f"{text} (see python -m {name} --help)")
 
 
-def output_folder(path, overwrite):
+def output_folder(path, overwrite, outputs=()):
     """Make the folder of a run, or refuse one that already holds something.
+
+    Of an earlier run that is overwritten, the `outputs` are removed: they must not be taken for those of this one.
 
     Raises:
         InputError: when it is in use and `overwrite` is off, or can't be written to.
@@ -73,9 +75,30 @@ def output_folder(path, overwrite):
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
-            return folder
+            pass
     except OSError as error:
         raise InputError(f"--out {folder}: can't be written to ({error.strerror})") from None
+    for name in outputs:
+        (folder / name).unlink(missing_ok=True)
+    return folder
+
+
+def output_file(option, path, overwrite, example):
+    """The file that an option names, or None if it names none.
+
+    Raises:
+        InputError: when it is a folder, is in use and `overwrite` is off, or its folder doesn't exist.
+    """
+    if path is None:
+        return None
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{option} {path}: is a folder, expected a file name such as {path / example}")
+    if path.exists() and not overwrite:
+        raise InputError(f"{option} {path}: exists; name another file or add --overwrite")
+    if not path.parent.is_dir():
+        raise InputError(f"{option} {path}: there is no folder {path.parent}")
+    return path
 
 
 def write_json(path, content):

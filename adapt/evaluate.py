@@ -1,7 +1,6 @@
 """Fly a policy over the test episodes: `python -m adapt.evaluate --system quadrotor --target drag=0.3`."""
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Annotated
 
 import tyro
@@ -51,7 +50,7 @@ def main(options):
         raise InputError(f"--split {options.split}: expected one of {', '.join(SPLITS)}")
     if options.episodes is not None and options.episodes < 1:
         raise InputError(f"--episodes {options.episodes}: expected at least 1")
-    out = _out(options)
+    out = command.output_file("--out", options.out, options.overwrite, "metrics.json")
     command.check_seed(options.seed)
     command.set_threads(options.threads)
     device = command.pick_device(options.device)
@@ -82,19 +81,6 @@ def main(options):
         }
         command.write_json(out, content)
         print(f"results in {out}")
-
-
-def _out(options):
-    if options.out is None:
-        return None
-    path = Path(options.out)
-    if path.is_dir():
-        raise InputError(f"--out {path}: is a folder, expected a file name such as {path / 'metrics.json'}")
-    if path.exists() and not options.overwrite:
-        raise InputError(f"--out {path}: exists; name another file or add --overwrite")
-    if not path.parent.is_dir():
-        raise InputError(f"--out {path}: there is no folder {path.parent}")
-    return path
 
 
 if __name__ == "__main__":

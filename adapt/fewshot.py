@@ -78,9 +78,8 @@ def main(options):
     setting = _setting(options)
     policy = _policy(options, setting)
     recorded, validation = _recorded(options, setting)
-    folder = command.output_folder(options.out or _default_folder(options), options.overwrite)
-    for name in (*RESULTS, *PICTURES):  # what an earlier run left must not be taken for this one's
-        (folder / name).unlink(missing_ok=True)
+    outputs = (*RESULTS, *PICTURES)
+    folder = command.output_folder(options.out or _default_folder(options), options.overwrite, outputs)
     adaptation = _adapt(options, setting, policy, recorded, folder, device)
     metrics = _metrics(options, policy, adaptation, validation)
     command.write_json(folder / "metrics.json", metrics)
@@ -210,7 +209,6 @@ def _adapt(options, setting, policy, recorded, folder, device):
             seed=options.seed,
             config=replace(FINETUNE, updates=updates),
             oracle=options.oracle,
-            context=None if recorded is None or recorded.context is None else recorded.context.mean(0),
             progress=lambda steps: tqdm(steps, total=updates, desc="fine-tuning", unit="update"),
             stage=lambda name: print(f"{name} ...", flush=True),
             keep=keep,

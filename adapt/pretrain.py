@@ -68,7 +68,6 @@ class Options:
 
 def main(options):
     """Train, validate and save until the last update."""
-    import torch
 
     from envs import make_dynamics, make_task
     from policies import apg
@@ -95,7 +94,6 @@ def main(options):
     if options.resume:
         _restore(run, folder, identity, banks, config, task)
     command.write_json(folder / "config.json", report)
-    torch.manual_seed(options.seed)
     _train(run, dynamics, task, banks, config, options, folder, identity)
 
 
@@ -118,10 +116,7 @@ def _folder(options, system):
         if not (path / "training.pt").is_file():
             raise InputError(f"--resume: {path} holds no training.pt to continue from")
         return path
-    folder = command.output_folder(path, options.overwrite)
-    for name in OUTPUTS:  # what an earlier run left must not be taken for this one's
-        (folder / name).unlink(missing_ok=True)
-    return folder
+    return command.output_folder(path, options.overwrite, OUTPUTS)
 
 
 def _identity(options, task, config):

@@ -42,7 +42,7 @@ class FitReport:
     """What was chosen and what it is worth.
 
     `before` and `after` are one-step errors (see `prediction_error`) on the held-out transitions, `after` of a residual
-    fitted without them; the residual that is returned has seen all.
+    fitted without them, though they chose what it may keep; the residual that is returned has seen all.
     """
 
     kind: str

@@ -50,15 +50,7 @@ def main(options):
 def _check(options):
     if not options.runs:
         raise InputError("no runs: name folders of adapt.fewshot, or JSON files of adapt.evaluate")
-    if options.csv is None:
-        return
-    path = Path(options.csv)
-    if path.is_dir():
-        raise InputError(f"--csv {path}: is a folder, expected a file name such as {path / 'runs.csv'}")
-    if path.exists() and not options.overwrite:
-        raise InputError(f"--csv {path}: exists; name another file or add --overwrite")
-    if not path.parent.is_dir():
-        raise InputError(f"--csv {path}: there is no folder {path.parent}")
+    command.output_file("--csv", options.csv, options.overwrite, "runs.csv")
 
 
 def _refuse_repeated(table, runs):

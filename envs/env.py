@@ -40,9 +40,7 @@ class TrackingEnv(EnvBase):
         self.set_seed(seed)
 
     def _make_specs(self):
-        self._build_specs(self.batch_size)
-
-    def _build_specs(self, batch):
+        batch = self.batch_size
         start = torch.zeros(1, dtype=torch.long, device=self.device)
         state = self.task.start(self.episodes[:1], start)
         window = self.task.window(state, self.task.reference(self.episodes[:1], start, state))

@@ -12,8 +12,8 @@ import torch
 
 from envs import rigid_body
 from envs.errors import InputError
-from envs.quadrotor import attitude
 from envs.references import split_generator
+from envs.rigid_body import attitude
 from envs.system import Axis, System, Task
 
 
@@ -209,8 +209,7 @@ class FixedWing(System):
         return [[(centre[0] + n, centre[1] - e, centre[2] - d) for n, e, d in line] for line in turned]
 
     def project(self, x):
-        unit = rigid_body.normalised(attitude(x))
-        return x._replace(**dict(zip(("qw", "qx", "qy", "qz"), unit, strict=True)))
+        return rigid_body.with_unit_attitude(x)
 
 
 CRUISE = 11.5  # [m/s] speed at which the task starts

@@ -14,6 +14,7 @@ import torch
 from envs import references, rigid_body
 from envs.errors import InputError
 from envs.flatness import FlightLimits, flatness
+from envs.rigid_body import attitude
 from envs.shapes import NAMED
 from envs.system import Axis, System, Task
 from envs.waypoints import read_waypoints
@@ -40,11 +41,6 @@ class Action(NamedTuple):
     p_des: Any
     q_des: Any
     r_des: Any
-
-
-def attitude(x):
-    """The unit quaternion of a state, scalar first."""
-    return x.qw, x.qx, x.qy, x.qz
 
 
 @dataclass(frozen=True)
@@ -205,8 +201,7 @@ class Quadrotor(System):
         return [[_moved(x, point) for point in line] for line in lines]
 
     def project(self, x):
-        unit = rigid_body.normalised(attitude(x))
-        return x._replace(**dict(zip(("qw", "qx", "qy", "qz"), unit, strict=True)))
+        return rigid_body.with_unit_attitude(x)
 
 
 def _moved(x, point):

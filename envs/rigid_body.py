@@ -62,6 +62,17 @@ def normalised(q):
     return w * scale, x * scale, y * scale, z * scale
 
 
+def attitude(x):
+    """The quaternion of a state that has `qw, qx, qy, qz`."""
+    return x.qw, x.qx, x.qy, x.qz
+
+
+def with_unit_attitude(x):
+    """The state with its quaternion brought back to unit length, as `System.project` wants it."""
+    unit = normalised(attitude(x))
+    return x._replace(**dict(zip(("qw", "qx", "qy", "qz"), unit, strict=True)))
+
+
 def cross(a, b):
     """The vector product a x b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
