@@ -16,6 +16,7 @@ class TrackingEnv(EnvBase):
     | `step`        | (*B, 1)   | control periods since the start                          |
     | `observation` | (*B, o)   | what a policy sees of the state                          |
     | `window`      | (*B, H, w)| what a policy sees of the reference                      |
+    | `reference`   | (*B, H, r)| where the next H states should be; planners read it      |
     | `action`      | (*B, m)   | in [-1, 1]                                               |
     | `reward`      | (*B, 1)   | minus the task's cost of the step                        |
     | `terminated`  | (*B, 1)   | diverged, or arrived                                     |
@@ -43,7 +44,8 @@ class TrackingEnv(EnvBase):
         batch = self.batch_size
         start = torch.zeros(1, dtype=torch.long, device=self.device)
         state = self.task.start(self.episodes[:1], start)
-        window = self.task.window(state, self.task.reference(self.episodes[:1], start, state))
+        reference = self.task.reference(self.episodes[:1], start, state)
+        window = self.task.window(state, reference)
         observation = self.task.observe(state)
         table = {"device": self.device}
         count = {"dtype": torch.int64, **table}
@@ -58,6 +60,7 @@ class TrackingEnv(EnvBase):
             step=Bounded(0, self.task.steps, shape=(*batch, 1), **count),
             observation=real(observation),
             window=real(window),
+            reference=real(reference),
             diverged=flag,
             shape=batch,
             **table,
@@ -104,13 +107,15 @@ class TrackingEnv(EnvBase):
         """A TensorDict of the state and all that follows from it."""
         batch = state.shape[:-1]
         rows, flat_step, flat = self.episodes[episode.reshape(-1)], step.reshape(-1), state.reshape(-1, state.shape[-1])
-        window = self.task.window(flat, self.task.reference(rows, flat_step, flat))
+        reference = self.task.reference(rows, flat_step, flat)
+        window = self.task.window(flat, reference)
         described = {
             "state": state,
             "episode": episode,
             "step": step,
             "observation": self.task.observe(flat).reshape(*batch, -1),
             "window": window.reshape(*batch, *window.shape[1:]),
+            "reference": reference.reshape(*batch, *reference.shape[1:]),
             "diverged": self.task.diverged(rows, flat_step, flat).reshape(*batch, 1),
         }
         return TensorDict(described, batch_size=batch, device=self.device)

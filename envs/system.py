@@ -191,14 +191,17 @@ class Task(ABC):
 
     def cost(self, state, action, reference):
         """Weighted squared deviations (...) of state (..., n) from reference (..., r) and of action from trim."""
-        spread, state_weights, trim, action_weights = _cost_tables(self, state.dtype, state.device)
+        spread, state_weights, trim, action_weights = cost_tables(self, state.dtype, state.device)
         deviation = (state - reference @ spread).square() @ state_weights
         return deviation + (action - trim).square() @ action_weights
 
 
 @lru_cache(maxsize=64)
-def _cost_tables(task, dtype, device):
-    """The weights of a task as tensors; `spread` (r, n) places reference entries at their states."""
+def cost_tables(task, dtype, device):
+    """The quadratic cost of a task as tensors: `spread` (r, n), state weights (n,), trim (m,), action weights (m,).
+
+    `spread` places the entries of a reference at their states.
+    """
     names = task.system.State._fields
     table = {"dtype": dtype, "device": device}
     spread = torch.tensor([[float(a == b) for b in names] for a in task.reference_names], **table)
