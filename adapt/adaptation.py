@@ -18,15 +18,12 @@ from envs.dynamics import Dynamics
 from envs.env import TrackingEnv
 from envs.errors import InputError
 from policies import apg
+from policies.apg import FINETUNE
 from policies.checkpoints import Policy
 from policies.evaluate import Evaluation, evaluate, test_episodes
 from policies.networks import as_actor
 
 HELD_OUT = 1000  # transitions flown for the report alone, to measure the prediction error
-
-# The policy is trained already: no curriculum, a lower learning rate, few updates. They visit few states, so these are
-# spread by more noise than in training; without it a rare flight far from the others can get worse.
-FINETUNE = apg.APGConfig(updates=200, learning_rate=1e-3, curriculum=0.0, warmup=0.05, exploration=0.2, episodes=1000)
 
 
 @dataclass(frozen=True)
@@ -63,6 +60,13 @@ def finetune(policy, dynamics, config=FINETUNE, seed=0, progress=None):
         raise InputError("fine-tuning: no update had a finite gradient; the residual may be of the wrong scale")
     info = {**policy.info, "finetuned_updates": run.update, "finetune_seed": seed}
     return Policy(network, policy.task, info), history
+
+
+def learn(policy, target, samples, kind="acceleration", exploration=0.1, seed=0):
+    """Fly a policy in a target and fit a residual to its source: (transitions, residual, report), as `adapt` does."""
+    device = next(policy.network.parameters()).device
+    transitions = _flown(as_actor(policy.network), target, policy.task, samples, exploration, seed, device)
+    return transitions, *residuals.fit_residual(transitions, Dynamics(policy.task.system), kind, seed)
 
 
 def adapt(

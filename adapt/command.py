@@ -134,20 +134,20 @@ def pick_robot(name, vehicle):
     return own.system, own
 
 
-def pick_policy(path, system, vehicle):
+def pick_policy(path, system, vehicle, method="apg"):
     """The policy at `path`, or the one that ships for the robot.
 
     Raises:
-        InputError: when there is none, or it was trained for another robot.
+        InputError: when there is none, or it was trained for another robot or by another method.
     """
     from policies.checkpoints import load_policy, pretrained
 
     name = vehicle.name if vehicle else system.name
-    if path is None and pretrained(name) is None:
-        option = "vehicle" if vehicle else "system"
-        advice = f"train one with python -m adapt.pretrain and the same --{option}, then name its policy.safetensors"
-        raise InputError(f"--policy: none ships for {name}; {advice}")
-    return load_policy(path or name, system)
+    if path is None and pretrained(name, method) is None:
+        same = f"the same --{'vehicle' if vehicle else 'system'}" + ("" if method == "apg" else " and --method")
+        advice = f"train one with python -m adapt.pretrain and {same}, then name its policy.safetensors"
+        raise InputError(f"--policy: none ships for {name}{'' if method == 'apg' else f' by {method}'}; {advice}")
+    return load_policy(path or name, system, method)
 
 
 @contextlib.contextmanager

@@ -1,22 +1,25 @@
-"""Fly a policy over the test episodes: `python -m adapt.evaluate --system quadrotor --target drag=0.3`."""
+"""Fly a controller of any method over the test episodes: `python -m adapt.evaluate --system quadrotor --method mpc`."""
 
 from dataclasses import asdict, dataclass
 from typing import Annotated
 
 import tyro
 
-from adapt import command
+from adapt import command, controllers
 from envs.errors import InputError
 
 
 @dataclass(frozen=True)
 class Options:
-    """Evaluate a policy in closed loop over test episodes and print the metric, success and time per action."""
+    """Evaluate a controller in closed loop over test episodes: metric, success, time per action and failures."""
 
     system: str = "quadrotor"
     """Robot: cartpole, quadrotor or fixed_wing."""
+    method: str = "apg"
+    """apg, ppo or pets (trained), or a planner: mpc in the nominal model, mpc-residual in that completed by a residual
+    learned in the target, mpc-target in the true target."""
     policy: str | None = None
-    """Checkpoint (default: the one that ships for the robot)."""
+    """Checkpoint of a trained method (default: the one that ships for the robot)."""
     target: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """What is different, such as drag=0.3 or mass=x1.2; may be repeated (default: nothing, the source)."""
     vehicle: str | None = None
@@ -28,7 +31,17 @@ class Options:
     episodes: int | None = None
     """Number of episodes (default: 50; fixed_wing: 30)."""
     seed: int = 0
-    """Seed of the episodes."""
+    """Seed of the episodes, and of whatever else is drawn."""
+    residual: str | None = None
+    """Residual of mpc-residual, as adapt.fewshot writes it (default: fit one)."""
+    samples: int | None = None
+    """Transitions that mpc-residual fits its residual to (default: 1000)."""
+    solver: str | None = None
+    """Solver of a planner: fatrop (default), rti (one Gauss-Newton iteration) or ipopt."""
+    compile: bool = False
+    """Compile the solver of a planner to machine code (needs a C compiler; kept for the next time)."""
+    horizon: int | None = None
+    """Control periods that a planner looks ahead (default: those of the task)."""
     out: str | None = None
     """File for the results as JSON."""
     overwrite: bool = False
@@ -41,46 +54,55 @@ class Options:
 
 def main(options):
     """Evaluate, print, and write JSON if asked for."""
-    from envs.references import SPLITS
-    from envs.registry import make_dynamics, make_task
+    from envs.registry import make_dynamics
     from policies.evaluate import action_time, evaluate, test_episodes
-    from policies.networks import as_actor
 
+    out = check(options)
+    command.set_threads(options.threads)
+    device = command.pick_device(options.device)
+    system, vehicle = command.pick_robot(options.system, options.vehicle)
+    dynamics = make_dynamics(system, options.target)
+    controller = controllers.obtain(options, system, vehicle, dynamics, device)
+    task, actor = controller.task, controller.actor
+    episodes = test_episodes(task, options.episodes, options.split, options.seed).to(device)
+    result = evaluate(actor, dynamics, task, episodes, _progress(options))
+    counts = {name: getattr(actor, name) for name in ("calls", "failures") if hasattr(actor, name)}
+    spent = action_time(actor.to("cpu"), dynamics, task)
+    flown = f"{options.system} {task.set} {' '.join(options.target) or 'source'}"
+    print(f"{flown}, {options.method}: {task.metric} {result}")
+    print(f"time per action: median {spent['median_ms']:.3f} ms, 99th percentile {spent['p99_ms']:.3f} ms, one thread")
+    if counts:
+        print(f"failed plans: {counts['failures']} of {counts['calls']}, each replaced by the one before")
+    if out:
+        content = {"options": asdict(options), "method": options.method, "set": task.set, "horizon": task.horizon}
+        content |= {"metric": task.metric, "unit": task.unit, **result.summary, **spent, **counts}
+        content |= {"policy_info": controller.info, "table": result.table.to_dict("list")}
+        command.write_json(out, content | command.environment(options.seed, options.threads))
+        print(f"results in {out}")
+
+
+def check(options):
+    """Refuse what can be told without loading anything; returns the file for the results."""
+    from envs.references import SPLITS
+
+    controllers.check(options)
     if options.split not in SPLITS:
         raise InputError(f"--split {options.split}: expected one of {', '.join(SPLITS)}")
     if options.episodes is not None and options.episodes < 1:
         raise InputError(f"--episodes {options.episodes}: expected at least 1")
-    out = command.output_file("--out", options.out, options.overwrite, "metrics.json")
     command.check_seed(options.seed)
-    command.set_threads(options.threads)
-    device = command.pick_device(options.device)
-    system, vehicle = command.pick_robot(options.system, options.vehicle)
-    policy = command.pick_policy(options.policy, system, vehicle)
-    task = policy.task
-    if options.set:
-        task = make_task(system, options.set, horizon=task.horizon)
-    dynamics = make_dynamics(system, options.target)
-    episodes = test_episodes(task, options.episodes, options.split, options.seed).to(device)
-    result = evaluate(as_actor(policy.network.to(device)), dynamics, task, episodes)
-    spent = action_time(as_actor(policy.network.cpu()), task)
-    print(f"{options.system} {task.set} {' '.join(options.target) or 'source'}: {task.metric} {result}")
-    print(f"time per action: median {spent['median_ms']:.3f} ms, 99th percentile {spent['p99_ms']:.3f} ms, one thread")
-    if out:
-        content = {
-            "options": asdict(options),
-            "set": task.set,
-            "metric": task.metric,
-            "unit": task.unit,
-            **result.summary,
-            **spent,
-        }
-        content |= {
-            "policy_info": policy.info,
-            "table": result.table.to_dict("list"),
-            **command.environment(options.seed, options.threads),
-        }
-        command.write_json(out, content)
-        print(f"results in {out}")
+    return command.output_file("--out", options.out, options.overwrite, "metrics.json")
+
+
+def _progress(options):
+    """A bar over the steps of a flight for methods that plan online, which take minutes."""
+    if options.method in ("apg", "ppo"):
+        return None
+    from functools import partial
+
+    from tqdm import tqdm
+
+    return partial(tqdm, desc="flying", unit="step", leave=False)
 
 
 if __name__ == "__main__":

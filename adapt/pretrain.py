@@ -1,31 +1,42 @@
-"""Train a policy in the nominal robot: `python -m adapt.pretrain --system quadrotor --seed 0`."""
+"""Train a policy by any method, or go on with one: `python -m adapt.pretrain --system quadrotor --seed 0`."""
 
-import csv
+import copy
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from adapt import command
+from adapt.training_log import Log, score_of
 from envs.errors import InputError
+from policies import pick_method
 from policies.files import whole
 
 OUTPUTS = ("policy.safetensors", "log.csv", "training.pt")
-LOG = ("update", "seconds", "cost", "gradient_norm", "threshold", "stage", "resets", "skipped", "error", "success")
+SETTINGS = ("updates", "samples", "batch", "width", "learning_rate", "curriculum", "exploration")
+UNNAMED = ("out", "overwrite", "resume", "device", "threads")  # options that don't change what is trained
 
 
 @dataclass(frozen=True)
 class Options:
-    """Train a policy by analytic policy gradient in the nominal robot.
+    """Train a policy in the nominal robot, by analytic policy gradient unless --method says otherwise.
 
     Writes policy.safetensors (the best on validation), log.csv, config.json and training.pt (to resume from).
-    Settings that are not given take the values tuned for the system.
+    Settings that are not given take the values tuned for the system. With --policy the training of a policy goes on in
+    a changed robot (--target) or in a model with a residual (--residual), and what is written is the last policy: to
+    choose the best would take flights in the target that --samples doesn't count.
     """
 
     system: str = "quadrotor"
     """Robot: cartpole, quadrotor or fixed_wing."""
+    method: str = "apg"
+    """apg, ppo or pets."""
+    policy: str | None = None
+    """Checkpoint to go on with (default: start anew)."""
+    residual: str | None = None
+    """Train in the nominal robot completed by this residual, as adapt.fewshot writes it."""
     vehicle: str | None = None
     """Parameters of your own robot: a shipped name such as crazyflie, or a TOML file."""
     target: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
@@ -37,7 +48,9 @@ class Options:
     preset: str | None = None
     """Settings to start from: a system's tuned ones (default) or "paper"."""
     updates: int | None = None
-    """Gradient steps."""
+    """Gradient steps (apg)."""
+    samples: int | None = None
+    """Transitions that may be taken from the robot (ppo, pets)."""
     batch: int | None = None
     """Episodes flown side by side."""
     width: int | None = None
@@ -48,8 +61,8 @@ class Options:
     """Share of the updates after which the curriculum ends; 0 switches it off."""
     exploration: float | None = None
     """Standard deviation of noise on the flown actions."""
-    every: int = 500
-    """Updates between validations."""
+    every: int | None = None
+    """Updates between validations (apg: 500, others: a tenth of the run)."""
     stop_at: float | None = None
     """Stop as soon as the validation error is below this, all episodes succeeding."""
     out: str | None = None
@@ -69,23 +82,23 @@ class Options:
 def main(options):
     """Train, validate and save until the last update."""
 
-    from envs import make_dynamics, make_task
-    from policies import apg
+    from envs import make_task
+    from policies.apg import training_banks
 
-    command.check_seed(options.seed)
+    check(options)
     command.set_threads(options.threads)
     device = command.pick_device(options.device)
-    if options.every < 1:
-        raise InputError(f"--every {options.every}: expected at least 1")
     system, _ = command.pick_robot(options.system, options.vehicle)
     config = configuration(options, system)
     task = make_task(system, options.set)
-    dynamics = make_dynamics(system, options.target)
+    dynamics = _dynamics(options, system)
+    network = _network(options, system)
     task.episodes(1, "train", options.seed)  # what can't be flown is told before anything is written
     folder = _folder(options, system)
     identity = _identity(options, task, config)
-    banks = apg.training_banks(task, config, options.seed, device)
-    run = apg.begin(dynamics, task, banks, config, options.seed)
+    banks = training_banks(task, config, options.seed, device)
+    method = pick_method(options.method).module
+    run = method.begin(dynamics, task, banks, config, options.seed, network and network.to(device))
     report = {
         "options": asdict(options),
         "config": asdict(config),
@@ -97,21 +110,63 @@ def main(options):
     _train(run, dynamics, task, banks, config, options, folder, identity)
 
 
+def check(options):
+    """Refuse what can be told without loading anything."""
+    pick_method(options.method, trained=True)
+    command.check_seed(options.seed)
+    if options.every is not None and options.every < 1:
+        raise InputError(f"--every {options.every}: expected at least 1")
+    if options.residual and options.target:
+        raise InputError("--residual: the robot is the model with the residual then; leave --target out")
+    if options.policy and options.width is not None:
+        raise InputError("--width: is that of the policy that --policy names; leave it out")
+    if options.compile and options.method != "apg":
+        raise InputError(
+            f"--compile: is for apg, which differentiates the dynamics; {options.method} has no use for it"
+        )
+
+
 def configuration(options, system):
     """The tuned settings of a system, or of `--preset`, with what the command line changes."""
-    from policies import apg
-
+    method = pick_method(options.method, trained=True).module
     name = options.preset or system.name
-    if name not in apg.PRESETS and options.preset:
-        raise InputError(f"--preset {name}: expected one of {', '.join(apg.PRESETS)}")
-    names = ("updates", "batch", "width", "learning_rate", "curriculum", "exploration")
-    changes = {key: getattr(options, key) for key in names if getattr(options, key) is not None}
-    return replace(apg.PRESETS.get(name, apg.APGConfig()), **changes)
+    if name not in method.PRESETS and options.preset:
+        raise InputError(f"--preset {name}: expected one of {', '.join(method.PRESETS)}")
+    config = method.PRESETS.get(name, method.Config())
+    if options.policy:
+        config = method.finetuning(config)
+    changes = {key: getattr(options, key) for key in SETTINGS if getattr(options, key) is not None}
+    known = {item.name for item in fields(config)}
+    for key in changes.keys() - known:
+        raise InputError(f"--{key.replace('_', '-')}: {options.method} has no such setting; leave it out")
+    return replace(config, **changes)
+
+
+def _dynamics(options, system):
+    """What the policy is trained in."""
+    from envs import make_dynamics
+
+    if not options.residual:
+        return make_dynamics(system, options.target)
+    from adapt.residual_kinds import load_residual
+
+    return load_residual(options.residual, make_dynamics(system)).requires_grad_(False)
+
+
+def _network(options, system):
+    """The network to go on with, or None."""
+    if not options.policy:
+        return None
+    from policies.checkpoints import load_policy
+
+    return copy.deepcopy(load_policy(options.policy, system, options.method).network)
 
 
 def _folder(options, system):
     name = (options.vehicle and Path(options.vehicle).stem) or system.name
-    path = Path(options.out or f"runs/pretrain-{name}-seed{options.seed}")
+    name = name if options.method == "apg" else f"{options.method}-{name}"
+    kind = "finetune" if options.policy else "pretrain"
+    path = Path(options.out or f"runs/{kind}-{name}-seed{options.seed}")
     if options.resume:
         if not (path / "training.pt").is_file():
             raise InputError(f"--resume: {path} holds no training.pt to continue from")
@@ -122,7 +177,8 @@ def _folder(options, system):
 def _identity(options, task, config):
     """What must not change where a run is continued."""
     robot = {"system": task.system.name, "vehicle": repr(task.system), "target": " ".join(options.target)}
-    return {**robot, "set": task.set, "seed": options.seed, **asdict(config)}
+    start = {name: getattr(options, name) for name in ("method", "policy", "residual")}
+    return {**robot, **start, "set": task.set, "seed": options.seed, **asdict(config)}
 
 
 def _restore(run, folder, identity, banks, config, task):
@@ -148,19 +204,19 @@ def _restore(run, folder, identity, banks, config, task):
 def _train(run, dynamics, task, banks, config, options, folder, identity):
     from tqdm import tqdm
 
-    from policies import apg
-
+    method = pick_method(options.method).module
+    every = options.every or getattr(config, "every", -(-config.updates // 10))
     log = Log(folder, until=run.update)
     best = log.best()
     begin = time.perf_counter() - log.seconds()
     flown = compiled(dynamics) if options.compile else dynamics
     bar = tqdm(total=config.updates, initial=run.update, desc=f"training {task.system.name}", unit="update")
     try:
-        for metrics in _until_interrupted(run, apg.train(run, flown, task, banks, config), folder, identity):
+        for metrics in _until_interrupted(run, method.train(run, flown, task, banks, config), folder, identity):
             bar.update()
-            if run.update % options.every and run.update != config.updates:
+            if run.update % every and run.update != config.updates:
                 continue
-            result = validate(run.network, dynamics, task)
+            result = validate(method.actor(run.network, task), dynamics, task, getattr(config, "validations", 100))
             bar.set_postfix_str(f"validation {result['mean']:.4f} {task.unit}, success {result['success']:.2f}")
             row = {
                 **metrics,
@@ -192,13 +248,12 @@ def _until_interrupted(run, updates, folder, identity):
                 raise KeyboardInterrupt(f"continue with the same options, --resume and --out {folder}")
 
 
-def validate(network, dynamics, task, n=100):
+def validate(actor, dynamics, task, n=100):
     """Summary of `n` validation episodes."""
     from policies.evaluate import evaluate, test_episodes
-    from policies.networks import as_actor
 
-    device = next(network.parameters()).device
-    return evaluate(as_actor(network), dynamics, task, test_episodes(task, n, "validation").to(device)).summary
+    device = next(actor.parameters()).device
+    return evaluate(actor, dynamics, task, test_episodes(task, n, "validation").to(device)).summary
 
 
 def compiled(dynamics):
@@ -216,22 +271,32 @@ def compiled(dynamics):
 
 
 def _keep_best(run, task, options, folder, row, best):
-    """Save the policy if it succeeds more often than the best so far, or as often and more accurately."""
+    """Save the policy if it succeeds more often than the best so far, or as often and more accurately.
+
+    One whose training went on in a target is saved in any case: the best so far has no meaning for it.
+    """
     from policies.checkpoints import save_policy
 
-    score = _score(row)
-    if score >= best:
+    score = score_of(row)
+    if score >= best and not options.policy:
         return best
     info = {"validation": score[1], "success": row["success"], "unit": task.unit, "update": row["update"]}
-    info |= {"seed": options.seed, "method": "apg", "seconds": round(row["seconds"], 1)}
-    save_policy(folder / "policy.safetensors", run.network, task, info)
+    info |= {"seed": options.seed, "method": options.method, "samples": row["samples"], "command": said(options)}
+    info |= {"seconds": round(row["seconds"], 1)}
+    save_policy(folder / "policy.safetensors", run.network, task, info, options.method)
     return score
 
 
-def _score(row):
-    """(minus success, error) of a row: the smaller, the better. Without any success there is no error."""
-    error = float(row["error"])
-    return -float(row["success"]), error if error == error else float("inf")
+def said(options):
+    """The command that makes the same policy again."""
+    words = ["python -m adapt.pretrain"]
+    for item in fields(options):
+        value = getattr(options, item.name)
+        if value != item.default and item.name not in UNNAMED:
+            flag = f"--{item.name.replace('_', '-')}"
+            values = value if isinstance(value, tuple) else (value,)
+            words += [flag] if value is True else [f"{flag} {part}" for part in values]
+    return " ".join(words)
 
 
 def _save_training(run, folder, identity):
@@ -243,48 +308,6 @@ def _save_training(run, folder, identity):
     torch.save({**run.state_dict(), "identity": identity}, content)
     with whole(folder / "training.pt") as partial:
         partial.write_bytes(content.getvalue())
-
-
-class Log:
-    """log.csv, and TensorBoard where it is installed."""
-
-    def __init__(self, folder, until):
-        path = folder / "log.csv"
-        rows = list(csv.DictReader(path.read_text().splitlines())) if path.is_file() else []
-        self.rows = [row for row in rows if int(row["update"]) <= until]  # the rest will be done again
-        self.path, self.board = path, _tensorboard(folder)
-
-    def write(self, row):
-        """Add a row; the file on disk is always whole."""
-        self.rows.append({key: row[key] for key in LOG})
-        with whole(self.path) as partial, partial.open("w", newline="") as file:
-            writer = csv.DictWriter(file, LOG)
-            writer.writeheader()
-            writer.writerows(self.rows)
-        for key in LOG[2:]:
-            if self.board:
-                self.board.add_scalar(key, row[key], row["update"])
-
-    def best(self):
-        """Best (minus success, error) so far."""
-        return min((_score(row) for row in self.rows), default=(1.0, float("inf")))
-
-    def seconds(self):
-        """Time spent before this run was resumed."""
-        return float(self.rows[-1]["seconds"]) if self.rows else 0.0
-
-    def close(self):
-        """Flush TensorBoard."""
-        if self.board:
-            self.board.close()
-
-
-def _tensorboard(folder):
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        return None
-    return SummaryWriter(str(folder / "tensorboard"))
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 
 from envs.errors import InputError
-from policies.networks import network_for
+from policies.networks import PlanNetwork, as_actor, network_for
 
 OPTIMIZERS = {
     "adam": lambda parameters: torch.optim.Adam(parameters),
@@ -73,6 +73,24 @@ PRESETS = {
         exploration=0.0,
     ),
 }
+
+
+Config, Network = APGConfig, PlanNetwork  # the names that every trained method has
+
+
+def actor(network, task, seed=0):
+    """The first action of the network's plan, as a TensorDict module; nothing is drawn, the seed doesn't matter."""
+    return as_actor(network)
+
+
+# The policy is trained already: no curriculum, a lower learning rate, few updates. They visit few states, so these are
+# spread by more noise than in training; without it a rare flight far from the others can get worse.
+FINETUNE = APGConfig(updates=200, learning_rate=1e-3, curriculum=0.0, warmup=0.05, exploration=0.2, episodes=1000)
+
+
+def finetuning(config):
+    """Settings to continue the training of a policy that was trained with `config`."""
+    return FINETUNE
 
 
 class Flight:
@@ -158,6 +176,11 @@ class Training:
     update: int = 0
     skipped: int = 0  # updates left out because their gradient was not finite
 
+    @property
+    def samples(self):
+        """Transitions flown so far."""
+        return self.update * len(self.flight.row)
+
     def state_dict(self):
         """Tensors and numbers only."""
         flight = {name: getattr(self.flight, name) for name in ("row", "step", "state")}
@@ -227,6 +250,7 @@ def train(run, dynamics, task, banks, config):
         run.update += 1
         yield {
             "update": run.update,
+            "samples": run.samples,
             "cost": float(cost.detach()),
             "gradient_norm": float(norm),
             "threshold": threshold,

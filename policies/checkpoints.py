@@ -15,25 +15,31 @@ from safetensors.torch import save
 
 from envs.errors import InputError
 from envs.registry import make_system, make_task
+from policies import METHODS
 from policies.files import whole
-from policies.networks import NetworkConfig, PlanNetwork
 
 FORMAT = "apg-adapt policy 1"
 
 
 @dataclass(frozen=True)
 class Policy:
-    """A loaded policy: network, the task it was trained for, and how it came about."""
+    """A loaded policy: network, the task it was trained for, how it came about, and the method it belongs to."""
 
-    network: PlanNetwork
+    network: torch.nn.Module
     task: object
     info: dict
+    method: str = "apg"
+
+    def actor(self, seed=0):
+        """The policy as a TensorDict module that writes `action`; a seed matters where it draws samples to plan."""
+        return METHODS[self.method].module.actor(self.network, self.task, seed)
 
 
-def save_policy(path, network, task, info):
+def save_policy(path, network, task, info, method="apg"):
     """Write a checkpoint; `info` is any JSON about how it came about (command, seed, validation error)."""
     metadata = {
         "format": FORMAT,
+        "method": method,
         "network": json.dumps(asdict(network.config)),
         "system": json.dumps({"name": task.system.name, **asdict(task.system)}),
         "task": json.dumps({"set": task.set, "steps": task.steps, "horizon": task.horizon}),
@@ -64,28 +70,34 @@ def read_tensors(path, format, what):
         raise InputError(f"{what} {path}: {reason} ({error})") from None
 
 
-def pretrained(name):
-    """Path of a checkpoint that ships with the package, or None."""
+def pretrained(name, method="apg"):
+    """Path of a checkpoint of a robot that ships with the package, or None."""
+    name = name if method == "apg" else f"{name}-{method}"
     path = resources.files("policies") / "pretrained" / f"{name}.safetensors"
     return Path(str(path)) if path.is_file() else None
 
 
-def load_policy(source, system=None):
+def load_policy(source, system=None, method="apg"):
     """Load a checkpoint from a path, or a shipped one by the name of its system.
 
     Args:
         system: the nominal robot that it is to fly; None accepts the one it was trained for.
+        method: the method that it must be of; None accepts any.
 
     Raises:
-        InputError: when there is no such checkpoint, or it was trained for another robot.
+        InputError: when there is no such checkpoint, or it was trained for another robot or by another method.
     """
-    path = pretrained(source) or Path(source)
+    path = pretrained(source, method or "apg") or Path(source)
     tensors, metadata = read_tensors(path, FORMAT, "policy")
+    found = metadata.get("method", "apg")  # earlier versions knew no other
+    if found != method and (method or found not in METHODS):
+        raise InputError(f"policy {path}: was made by the method {found!r}, expected {method or ', '.join(METHODS)!r}")
     try:
+        network_class = METHODS[found].module.Network
         trained_for = _system(json.loads(metadata["system"]))
-        config = _network_config(json.loads(metadata["network"]))
+        config = network_class.Config(**_hashable(json.loads(metadata["network"])))
         task = make_task(trained_for, **json.loads(metadata["task"]))
-        network = PlanNetwork(config)
+        network = network_class(config)
         network.load_state_dict(tensors)
         info = json.loads(metadata["info"])
     except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
@@ -94,20 +106,20 @@ def load_policy(source, system=None):
         ) from None
     if system is not None:
         _check_system(path, trained_for, system)
-    _check_contract(path, config, task)
+    _check_contract(path, config, network_class.contract(task))
     if not all(torch.isfinite(tensor).all() for tensor in tensors.values()):
         raise InputError(f"policy {path}: holds weights that are not finite; train it again")
-    return Policy(network.requires_grad_(True), task, info)
+    return Policy(network.requires_grad_(True), task, info, found)
 
 
 def _system(values):
-    values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+    values = _hashable(values)
     return replace(make_system(values.pop("name")), **values)
 
 
-def _network_config(values):
-    values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
-    return NetworkConfig(**values)
+def _hashable(values):
+    """What JSON made of the fields of a frozen dataclass: its tuples are lists there."""
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
 
 
 def _check_system(path, trained_for, wanted):
@@ -120,13 +132,8 @@ def _check_system(path, trained_for, wanted):
             raise InputError(f"policy {path}: trained for {field.name} = {theirs}, this robot has {ours}; {advice}")
 
 
-def _check_contract(path, config, task):
-    task = replace(task, set=task.sets[0])  # sizes are those of any set, and a file of waypoints may have gone
-    episodes, step = task.episodes(1, "train", 0), torch.zeros(1, dtype=torch.long)
-    state = task.start(episodes, step)
-    window = task.window(state, task.reference(episodes, step, state))
-    wanted = (task.observe(state).shape[-1], tuple(window.shape[-2:]), len(task.system.Action._fields), task.horizon)
-    found = (config.observations, config.window, config.actions, config.horizon)
-    if wanted != found:
-        sizes = "observation, window, action and horizon"
-        raise InputError(f"policy {path}: made for {sizes} of sizes {found}, the task has {wanted}; train it again")
+def _check_contract(path, config, contract):
+    for name, wanted in contract.items():
+        found = getattr(config, name)
+        if found != wanted:
+            raise InputError(f"policy {path}: made for {name} = {found}, the task has {wanted}; train it again")

@@ -42,23 +42,31 @@ class Evaluation:
         return f"{s['mean']:.4f} ± {s['std']:.4f} {self.unit}, success {s['success']:.2f}, N = {s['n']}"
 
 
-def evaluate(actor, dynamics, task, episodes):
+def evaluate(actor, dynamics, task, episodes, progress=None):
     """Fly every row of `episodes` once from its start with a TensorDict policy; deterministic.
 
-    States behind the end of an episode repeat the last one.
+    States behind the end of an episode repeat the last one. The policy is still called on such a row while others fly,
+    with `done` set, so that a planner can leave it out; when all have ended, so does the evaluation.
+
+    Args:
+        progress: wraps the iterable of steps, as `tqdm` does.
     """
     env = TrackingEnv(dynamics, task, episodes, batch_size=(len(episodes),), device=episodes.device)
     rows = torch.arange(len(episodes), device=episodes.device).unsqueeze(-1)
     now = env.reset(TensorDict({"episode": rows}, batch_size=env.batch_size))
     states, actions, done = [now["state"]], [], torch.zeros_like(now["done"])
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        for _ in range(task.steps):
+        for _ in progress(range(task.steps)) if progress else range(task.steps):
             following = env.step(actor(now))
             states.append(torch.where(done, states[-1], following["next", "state"]))
             actions.append(following["action"])
             done = done | following["next", "done"]
-            now = step_mdp(following)
-    states = torch.stack(states, 1)
+            now = step_mdp(following).set("done", done)
+            if done.all():
+                break
+    missing = task.steps - len(actions)
+    states = torch.stack(states + missing * states[-1:], 1)
+    actions += missing * [torch.zeros_like(actions[-1])]
     error, success = task.score(episodes, states)
     table = {"episode": range(len(episodes)), "error": error.cpu().numpy(), "success": success.cpu().numpy()}
     return Evaluation(pd.DataFrame(table), task.metric, task.unit, states, torch.stack(actions, 1), episodes)
@@ -69,20 +77,53 @@ def test_episodes(task, n=None, split="test", seed=0):
     return task.episodes(n or TEST_EPISODES.get(task.system.name, 50), split, seed)
 
 
-def action_time(actor, task, calls=300):
-    """Median and 99th percentile [ms] of one action at batch 1 on one thread, observation included, after a warm-up."""
-    episodes, step = task.episodes(1, "validation", 0), torch.zeros(1, dtype=torch.long)
-    state = task.start(episodes, step)
+def action_time(actor, dynamics, task, calls=300):
+    """Median and 99th percentile [ms] of one action in flight: batch 1, one thread, observation included.
+
+    Validation episodes are flown in `dynamics`, because a planner is quicker where it can start from its last plan. The
+    first calls aren't timed.
+    """
+    flown = FlightForTiming(dynamics, task)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     seconds = []
-    with torch.no_grad():
-        for _ in range(WARM_UP + calls):
-            begin = time.perf_counter()
-            reference = task.reference(episodes, step, state)
-            seen = {"observation": task.observe(state), "window": task.window(state, reference), "state": state}
-            actor(TensorDict(seen, batch_size=(1,)))
-            seconds.append(time.perf_counter() - begin)
-    torch.set_num_threads(threads)
+    try:
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            for _ in range(WARM_UP + calls):
+                begin = time.perf_counter()
+                action = actor(flown.seen())["action"]
+                seconds.append(time.perf_counter() - begin)
+                flown.advance(action)
+    finally:
+        torch.set_num_threads(threads)
     seconds = seconds[WARM_UP:]
     return {"median_ms": 1e3 * float(np.median(seconds)), "p99_ms": 1e3 * float(np.quantile(seconds, 0.99))}
+
+
+class FlightForTiming:
+    """One validation episode after another at batch 1, without what an environment computes beside the observation."""
+
+    def __init__(self, dynamics, task, episodes=20):
+        self.dynamics, self.task = dynamics, task
+        self.episodes = task.episodes(episodes, "validation", 0)
+        self._begin(0)
+
+    def _begin(self, episode):
+        self.episode, self.step = torch.tensor([episode % len(self.episodes)]), torch.zeros(1, dtype=torch.long)
+        self.state = self.task.start(self.episodes[self.episode], self.step)
+
+    def seen(self):
+        """What a policy reads, computed now."""
+        task, state = self.task, self.state
+        reference = task.reference(self.episodes[self.episode], self.step, state)
+        seen = {"observation": task.observe(state), "window": task.window(state, reference), "reference": reference}
+        place = {"state": state, "episode": self.episode.unsqueeze(-1), "step": self.step.unsqueeze(-1)}
+        return TensorDict({**seen, **place}, batch_size=(1,))
+
+    def advance(self, action):
+        """One control period; the next episode where this one has ended."""
+        self.state, self.step = self.dynamics(self.state, action), self.step + 1
+        place = self.episodes[self.episode], self.step, self.state
+        ended = (self.step >= self.task.steps) | self.task.diverged(*place) | self.task.arrived(*place)
+        if bool(ended):
+            self._begin(int(self.episode) + 1)

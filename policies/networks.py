@@ -1,7 +1,8 @@
 """Policy networks: from what a policy sees to the next actions in [-1, 1]."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import ClassVar
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -32,6 +33,8 @@ class PlanNetwork(nn.Module):
     State and reference are normalised by fixed buffers, read by one layer each, joined, and passed through `widths`.
     tanh throughout; the output tanh equals the paper's sigmoid rescaled to [-1, 1].
     """
+
+    Config: ClassVar[type] = NetworkConfig
 
     def __init__(self, config: NetworkConfig):
         super().__init__()
@@ -73,6 +76,21 @@ class PlanNetwork(nn.Module):
         features = self.window_layer(window.reshape(-1, *window.shape[-2:]).transpose(-1, -2))
         return features.reshape(*batch, -1)
 
+    @staticmethod
+    def contract(task):
+        """The fields of a `NetworkConfig` that a task prescribes."""
+        task = replace(task, set=task.sets[0])  # sizes are those of any set, and a file of waypoints may have gone
+        episodes, step = task.episodes(1, "train", 0), torch.zeros(1, dtype=torch.long)
+        state = task.start(episodes, step)
+        window = task.window(state, task.reference(episodes, step, state))
+        return {
+            "observations": task.observe(state).shape[-1],
+            "window": tuple(window.shape[-2:]),
+            "actions": len(task.system.Action._fields),
+            "horizon": task.horizon,
+            "encoder": task.encoder,
+        }
+
     @torch.no_grad()
     def normalise(self, observation, window):
         """Take the normalisation from samples (N, o) and (N, H, w); entries that hardly vary keep unit scale."""
@@ -93,18 +111,7 @@ def network_for(task, width=None, **shape):
     """
     features, *widths = task.layers if width is None else (width,) * len(task.layers)
     shape = {"features": features, "widths": tuple(widths), **shape}
-    episodes = task.episodes(1, "train", 0)
-    step = torch.zeros(1, dtype=torch.long)
-    state = task.start(episodes, step)
-    window = task.window(state, task.reference(episodes, step, state))
-    sizes = {
-        "observations": task.observe(state).shape[-1],
-        "window": tuple(window.shape[-2:]),
-        "actions": len(task.system.Action._fields),
-        "horizon": task.horizon,
-        "encoder": task.encoder,
-    }
-    return PlanNetwork(NetworkConfig(**sizes, **shape))
+    return PlanNetwork(NetworkConfig(**{**PlanNetwork.contract(task), **shape}))
 
 
 class FirstAction(nn.Module):

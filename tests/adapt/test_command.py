@@ -220,7 +220,7 @@ def test_a_vehicle_is_its_system_and_must_be_of_the_named_kind():
 
 
 def test_where_no_policy_ships_the_command_that_makes_one_is_named(monkeypatch):
-    monkeypatch.setattr("policies.checkpoints.pretrained", lambda name: None)
+    monkeypatch.setattr("policies.checkpoints.pretrained", lambda name, method: None)
     with pytest.raises(InputError, match=r"none ships for crazyflie; .*adapt\.pretrain and the same --vehicle"):
         command.pick_policy(None, *command.pick_robot("quadrotor", "crazyflie"))
     with pytest.raises(InputError, match=r"none ships for cartpole; .*adapt\.pretrain and the same --system"):

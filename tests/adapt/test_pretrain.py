@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from adapt import pretrain
+from adapt import pretrain, training_log
 from envs import make_dynamics, make_system
 from policies import apg, evaluate
 from policies.checkpoints import load_policy
-from policies.networks import network_for
+from policies.networks import as_actor, network_for
 
 ROOT = Path(__file__).parents[2]
 TINY = ("--system", "cartpole", "--updates", 12, "--every", 4, "--batch", 4, "--width", 8)
@@ -28,9 +28,9 @@ def few_validations(monkeypatch):
     """Few short validations, and no TensorBoard files where it happens to be installed."""
     whole = pretrain.validate
     monkeypatch.setattr(
-        pretrain, "validate", lambda network, dynamics, task: whole(network, dynamics, replace(task, steps=20), n=3)
+        pretrain, "validate", lambda actor, dynamics, task, n: whole(actor, dynamics, replace(task, steps=20), n=3)
     )
-    monkeypatch.setattr(pretrain, "_tensorboard", lambda folder: None)
+    monkeypatch.setattr(training_log, "_tensorboard", lambda folder: None)
 
 
 def rows(folder):
@@ -64,7 +64,9 @@ def test_it_leaves_a_policy_a_log_its_settings_and_what_resumes_it(call, tmp_pat
     assert answer.errors == []
     assert {path.name for path in folder.iterdir()} == FILES
     assert [int(row["update"]) for row in rows(folder)] == [4, 8, 12]
-    assert set(rows(folder)[0]) == set(pretrain.LOG)
+    named = {"update", "samples", "seconds", "cost", "gradient_norm", "threshold", "stage", "resets", "skipped"}
+    assert set(rows(folder)[0]) == named | {"error", "success"}
+    assert [int(row["samples"]) for row in rows(folder)] == [4 * 4, 8 * 4, 12 * 4]
     policy = load_policy(folder / "policy.safetensors", make_system("cartpole"))
     assert policy.info["seed"] == 3
     assert policy.info["update"] in (4, 8, 12)
@@ -358,7 +360,7 @@ def test_validation_is_not_the_test(rough_cartpole, monkeypatch):
     whole = evaluate.test_episodes
     monkeypatch.setattr(evaluate, "test_episodes", lambda task, n, split: asked.append(split) or whole(task, n, split))
     task = rough_cartpole.task
-    pretrain.validate(network_for(task), make_dynamics("cartpole"), task)
+    pretrain.validate(as_actor(network_for(task)), make_dynamics("cartpole"), task, 100)
     assert asked == ["validation"]
 
 

@@ -1,5 +1,6 @@
 """The closed-loop evaluation: controllers whose result is known on paper, and independence of everything else."""
 
+import itertools
 import math
 import time
 
@@ -209,7 +210,7 @@ def test_the_first_calls_warm_up_and_are_not_timed():
             time.sleep(0.05)
         return actor(tensordict)
 
-    spent = action_time(slow_at_first, task, calls=9)
+    spent = action_time(slow_at_first, make_dynamics("cartpole"), task, calls=9)
     assert len(calls) == 29
     assert spent["median_ms"] < 50
 
@@ -225,9 +226,44 @@ def test_the_time_of_an_action_is_taken_on_one_thread_which_is_undone(name):
 
     torch.set_num_threads(2)
     try:
-        spent = action_time(watched, task, calls=20)
+        spent = action_time(watched, make_dynamics(name), task, calls=20)
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(threads)
     assert set(seen) == {(1, (1,))}
     assert 0 < spent["median_ms"] <= spent["p99_ms"] < 1000
+
+
+def test_an_action_is_timed_in_flight_and_the_next_episode_follows_where_one_ends(name):
+    task = make_task(name)
+    step, seen = make_dynamics(name), []
+    hover = torch.tensor([task.system.trim_action])
+
+    def resting(tensordict):
+        seen.append(tensordict.clone())
+        return tensordict.set("action", hover)
+
+    action_time(resting, step, task, calls=task.steps)
+    assert [td["step"].item() for td in seen[:3]] == [0, 1, 2]
+    assert torch.allclose(seen[1]["state"], step(seen[0]["state"], hover))
+    later = [td for td in seen if td["episode"].item() == 1]
+    assert later[0]["step"].item() == 0
+    assert torch.equal(
+        later[0]["state"], task.start(task.episodes(20, "validation", 0)[1:2], torch.zeros(1, dtype=int))
+    )
+
+
+def test_a_policy_is_told_which_rows_have_ended_and_all_ended_ends_the_evaluation():
+    task = make_task("fixed_wing")
+    trim, calls = torch.tensor(task.system.trim_action), []
+
+    def level(tensordict):
+        calls.append(tensordict["done"].squeeze(-1).clone())
+        return tensordict.set("action", trim.expand(len(tensordict), -1).contiguous())
+
+    result = evaluate(level, make_dynamics("fixed_wing"), task, task.episodes(3, "test", 0))
+    assert not calls[0].any()
+    assert all((after | ~before).all() for before, after in itertools.pairwise(calls))
+    assert len(calls) < task.steps
+    assert result.states.shape == (3, task.steps + 1, 13)
+    assert result.actions.shape == (3, task.steps, 4)
