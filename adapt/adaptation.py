@@ -51,15 +51,14 @@ def finetune(policy, dynamics, config=FINETUNE, seed=0, progress=None):
     Returns:
         the new `Policy` and the metrics of each update.
     """
-    network = copy.deepcopy(policy.network)
-    bank = policy.task.episodes(config.episodes, "train", seed).to(next(network.parameters()).device)
-    run = apg.begin(dynamics, policy.task, [bank], config, seed, network)
+    bank = policy.task.episodes(config.episodes, "train", seed).to(next(policy.network.parameters()).device)
+    run = apg.begin(dynamics, policy.task, [bank], config, seed, policy.network)
     updates = apg.train(run, dynamics, policy.task, [bank], config)
     history = list(progress(updates) if progress else updates)
     if run.skipped == config.updates:
         raise InputError("fine-tuning: no update had a finite gradient; the residual may be of the wrong scale")
     info = {**policy.info, "finetuned_updates": run.update, "finetune_seed": seed}
-    return Policy(network, policy.task, info), history
+    return Policy(run.network, policy.task, info), history
 
 
 def learn(policy, target, samples, kind="acceleration", exploration=0.1, seed=0):

@@ -1,6 +1,5 @@
 """Train a policy by any method, or go on with one: `python -m adapt.pretrain --system quadrotor --seed 0`."""
 
-import copy
 import time
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -159,7 +158,7 @@ def _network(options, system):
         return None
     from policies.checkpoints import load_policy
 
-    return copy.deepcopy(load_policy(options.policy, system, options.method).network)
+    return load_policy(options.policy, system, options.method).network
 
 
 def _folder(options, system):
@@ -282,7 +281,8 @@ def _keep_best(run, task, options, folder, row, best):
         return best
     info = {"validation": score[1], "success": row["success"], "unit": task.unit, "update": row["update"]}
     info |= {"seed": options.seed, "method": options.method, "samples": row["samples"], "command": said(options)}
-    info |= {"seconds": round(row["seconds"], 1)}
+    place = "model + residual" if options.residual else " ".join(options.target) or "source"
+    info |= {"trained_in": place, "finetuned": options.policy is not None, "seconds": round(row["seconds"], 1)}
     save_policy(folder / "policy.safetensors", run.network, task, info, options.method)
     return score
 

@@ -16,7 +16,8 @@ from adapt import command
 from envs.errors import InputError
 from policies.files import replacing
 
-GROUP = ("system", "set", "target", "samples", "residual", "updates")  # runs that differ in more are not averaged
+# Runs that differ in more than their seed are not averaged.
+GROUP = ("system", "set", "target", "method", "solver", "horizon", "trained_in", "samples", "residual", "updates")
 STAGES = ("source", "zero_shot", "few_shot", "oracle")
 
 
@@ -118,16 +119,15 @@ def _figures(name, summary):
 
 
 def _evaluation_row(metrics):
-    options = metrics["options"]
+    options, info = metrics["options"], metrics["policy_info"]
     row = {"system": options["vehicle"] or options["system"], "set": metrics["set"]}
-    row |= {
-        "target": " ".join(options["target"]),
-        "policy": options["policy"] or "",
-        "seed": metrics["policy_info"]["seed"],
-    }
+    row |= {"target": " ".join(options["target"]), "method": metrics["method"], "policy": options["policy"] or ""}
+    row |= {"solver": info.get("solver", "") + (", compiled" if info.get("compile") else "")}
+    row |= {"horizon": metrics["horizon"], "trained_in": info.get("trained_in", info.get("model", ""))}
+    row |= {"samples": info.get("samples", ""), "seed": info.get("seed", metrics["seed"])}
     row |= _figures("error", metrics)
-    keys = ("metric", "unit", "median_ms", "p99_ms", "threads", "torch", "commit")
-    return row | {key: metrics[key] for key in keys}
+    keys = ("calls", "failures", "metric", "unit", "median_ms", "p99_ms", "threads", "torch", "commit")
+    return row | {key: metrics.get(key) for key in keys}
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ Policy Gradient": receding horizon, all actions of the horizon planned at once, 
 policy, a curriculum over the allowed divergence and the speed of the reference. Where we differ: see `APGConfig`.
 """
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import Literal
@@ -205,13 +206,18 @@ class Training:
 
 
 def begin(dynamics, task, banks, config, seed, network=None):
-    """A training run at its first update; without a network, a new one is drawn from the seed and normalised."""
+    """A training run at its first update, of a copy of the network.
+
+    Without a network, a new one is drawn from the seed and normalised.
+    """
     generator = torch.Generator().manual_seed(seed)
     if network is None:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             network = network_for(task, config.width).to(banks[0].device)
         normalise(network, task, dynamics, banks[-1], generator)
+    else:
+        network = copy.deepcopy(network)
     flight = Flight(task, dynamics, banks[0], config.batch, generator)
     return Training(network, OPTIMIZERS[config.optimizer](network.parameters()), flight, generator)
 

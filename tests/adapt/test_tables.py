@@ -23,10 +23,12 @@ def fewshot_run(folder, error=0.1, kind="acceleration", **changes):
     return folder
 
 
-def evaluation(path, seed):
+def evaluation(path, seed, method="apg", **info):
     """A file as `adapt.evaluate` writes it, as far as the tables read it."""
-    metrics = {"options": {"vehicle": None, "system": "cartpole", "target": [], "policy": "a"}, "set": "paper"}
-    metrics |= {"policy_info": {"seed": seed}, **SUMMARY, "metric": "error", "unit": "m", "median_ms": 0.1}
+    info = {"seed": seed, **info}
+    metrics = {"method": method, "horizon": 10, "seed": 0, "policy_info": info, **SUMMARY}
+    metrics |= {"options": {"vehicle": None, "system": "cartpole", "target": [], "policy": "a"}, "set": "paper"}
+    metrics |= {"metric": "error", "unit": "m", "median_ms": 0.1}
     path.write_text(json.dumps(metrics | {"p99_ms": 0.2, "threads": 1, **ENVIRONMENT}))
     return path
 
@@ -73,6 +75,15 @@ def test_evaluations_and_adaptations_stand_in_one_table(call, tmp_path):
     (line,) = lines(call("tables", *runs))
     assert line["error"] == "0.1000 ± 0.0000"
     assert len(lines(call("tables", *runs, fewshot_run(tmp_path / "a")))) == 2
+
+
+def test_methods_and_what_they_were_trained_in_and_with_are_not_averaged(call, tmp_path):
+    ways = [{}, {"method": "ppo"}, {"method": "ppo", "trained_in": "drag=0.3"}, {"method": "ppo", "samples": 1000}]
+    ways += [{"method": "mpc", "solver": "rti", "model": "source"}, {"method": "mpc", "solver": "rti", "compile": True}]
+    runs = [evaluation(tmp_path / f"{i}-{seed}.json", seed, **way) for i, way in enumerate(ways) for seed in (0, 1)]
+    table = lines(call("tables", *runs))
+    assert len(table) == len(ways)
+    assert {line["seeds"] for line in table} == {"2"}
 
 
 def test_two_runs_of_a_group_with_one_seed_are_refused_by_name(refused, tmp_path):
