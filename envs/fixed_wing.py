@@ -238,7 +238,7 @@ class Waypoint(Task):
     views: ClassVar[tuple[tuple[str, str], ...]] = (("px", "pz"), ("px", "py"))
     trace_name: ClassVar[str] = "distance to straight line"
     limit: ClassVar[float] = 20.0  # [m] farther off the straight line is a failure
-    nearest: ClassVar[float] = 1.0  # [m] the line is aimed as if the target were at least that far ahead
+    nearest: ClassVar[float] = 0.3  # [m] the line is aimed as if the target were at least that far ahead
 
     system: FixedWing = FixedWing()
     set: str = "waypoint"

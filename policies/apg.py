@@ -8,7 +8,7 @@ policy, a curriculum over the allowed divergence and the speed of the reference.
 import copy
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 
@@ -41,6 +41,7 @@ class APGConfig:
     curriculum: float = 0.5  # [-] share of the updates after which the last threshold and speed are reached
     exploration: float = 0.1  # [-] standard deviation of noise on the flown actions
     episodes: int = 4000  # training episodes drawn
+    every: ClassVar[int] = 500  # updates between validations, unless another number is asked for
 
     def __post_init__(self):
         for name in ("updates", "batch", "width", "learning_rate", "clip", "episodes"):

@@ -302,7 +302,7 @@ def test_close_to_the_target_and_behind_it_the_reference_still_leads_forward():
     task, target = make_task("fixed_wing"), torch.tensor([[50.0, 0.0, 0.0]], dtype=torch.float64)
     for x in (49.9, 50.0, 60.0):
         state = torch.zeros(1, 13).double()
-        state[:, :2] = torch.tensor([x, 1.0])
+        state[:, :2] = torch.tensor([x, task.nearest])
         step = task.reference(target, steps(0), state)[0, 0] - state[0, :3]
         expected = torch.tensor([1.0, -1.0, 0.0], dtype=torch.float64) / math.sqrt(2) * CRUISE * 0.05
         torch.testing.assert_close(step, expected)
