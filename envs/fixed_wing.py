@@ -211,6 +211,14 @@ class FixedWing(System):
     def project(self, x):
         return rigid_body.with_unit_attitude(x)
 
+    def difference(self, x, y):
+        """Way and rotation vector in the body axes of `x`, changes of body velocity and body rates."""
+        return *rigid_body.pose_difference(x, y), *(b - a for a, b in zip(x[7:], y[7:], strict=True))
+
+    def displaced(self, x, delta):
+        pose = rigid_body.pose_displaced(x, delta[:6])
+        return State(*pose, *(a + d for a, d in zip(x[7:], delta[6:], strict=True)))
+
 
 CRUISE = 11.5  # [m/s] speed at which the task starts
 

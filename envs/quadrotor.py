@@ -203,6 +203,15 @@ class Quadrotor(System):
     def project(self, x):
         return rigid_body.with_unit_attitude(x)
 
+    def difference(self, x, y):
+        """Way, rotation vector and change of velocity in the body axes of `x`, change of body rates."""
+        faster = rigid_body.to_body(attitude(x), tuple(b - a for a, b in zip(x[7:10], y[7:10], strict=True)))
+        return *rigid_body.pose_difference(x, y), *faster, *(b - a for a, b in zip(x[10:], y[10:], strict=True))
+
+    def displaced(self, x, delta):
+        faster = (*rigid_body.to_world(attitude(x), delta[6:9]), *delta[9:])
+        return State(*rigid_body.pose_displaced(x, delta[:6]), *(a + d for a, d in zip(x[7:], faster, strict=True)))
+
 
 def _moved(x, point):
     """A point of the body in world coordinates."""

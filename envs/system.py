@@ -82,6 +82,14 @@ class System(ABC):
         """Put a state back on its manifold after a step (unit quaternions)."""
         return x
 
+    def difference(self, x, y):
+        """What leads from state `x` to `y`: scalars in the tangent space of `x`, which a learned model predicts."""
+        return tuple(b - a for a, b in zip(x, y, strict=True))
+
+    def displaced(self, x, delta):
+        """The state that `delta` leads to from `x`: the inverse of `difference`."""
+        return self.State(*(a + d for a, d in zip(x, delta, strict=True)))
+
     def configured(self):
         """The same robot with its controller's beliefs fixed, so that a changed airframe no longer changes them."""
         return self
