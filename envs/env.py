@@ -22,19 +22,25 @@ class TrackingEnv(EnvBase):
     | `terminated`  | (*B, 1)   | diverged, or arrived                                     |
     | `diverged`    | (*B, 1)   | failed                                                   |
 
-    `truncated` is set at the last step of the task. Dynamics, domain and episodes belong to the environment, so a
-    partial reset can't lose them. Gradients flow through `rollout`.
+    `truncated` is set at the last step of the task, and where a robot strays beyond `threshold`. Dynamics, domain and
+    episodes belong to the environment, so a partial reset can't lose them. Gradients flow through `rollout`.
 
     Args:
         dynamics: anything that maps (..., n), (..., m) to (..., n) and has `.system`.
-        episodes: (N, ...) rows as `task.episodes` draws them.
+        episodes: (N, ...) rows as `task.episodes` draws them. May be exchanged for as many others while it runs.
+        anywhere: begin drawn episodes at random steps of their references instead of the first.
+        threshold: distance from the reference (`task.distance`) beyond which an episode is cut off; None: no limit.
+            May be changed while it runs.
     """
 
     batch_locked = False
 
-    def __init__(self, dynamics, task, episodes, batch_size=(), device="cpu", seed=0):
+    def __init__(
+        self, dynamics, task, episodes, batch_size=(), device="cpu", seed=0, *, anywhere=False, threshold=None
+    ):
         super().__init__(device=torch.device(device), batch_size=torch.Size(batch_size))
         self.dynamics, self.task = dynamics, task
+        self.anywhere, self.threshold = anywhere, threshold
         self.episodes = episodes.to(self.device)
         self._supports_set_state = True
         self._make_specs()
@@ -84,8 +90,23 @@ class TrackingEnv(EnvBase):
         else:
             episode = torch.randint(len(self.episodes), (*batch, 1), generator=self.generator).to(self.device)
         step = torch.zeros_like(episode)
+        state = self._started(episode, step)
+        if self.anywhere:
+            step, state = self._moved_on(episode, step, state)
+        return self._described(state, episode, step)
+
+    def _started(self, episode, step):
+        """The states (*B, n) on the references at the steps (*B, 1)."""
         state = self.task.start(self.episodes[episode.reshape(-1)], step.reshape(-1))
-        return self._described(state.reshape(*batch, -1), episode, step)
+        return state.reshape(*episode.shape[:-1], -1)
+
+    def _moved_on(self, episode, step, state):
+        """Random steps and the states there; an episode that would have arrived by then keeps its first."""
+        drawn = torch.randint(self.task.steps, episode.shape, generator=self.generator).to(self.device)
+        there = self._started(episode, drawn)
+        rows, flat = self.episodes[episode.reshape(-1)], there.reshape(-1, there.shape[-1])
+        over = self.task.arrived(rows, drawn.reshape(-1), flat).reshape(episode.shape)
+        return torch.where(over, step, drawn), torch.where(over, state, there)
 
     def _step(self, tensordict):
         batch = tensordict.batch_size
@@ -99,6 +120,10 @@ class TrackingEnv(EnvBase):
         arrived = self.task.arrived(rows, step.reshape(-1) + 1, flat).reshape(*batch, 1)
         following["terminated"] = following["diverged"] | arrived
         following["truncated"] = following["step"] >= self.task.steps
+        if self.threshold is not None:
+            near = self.task.distance(rows, step.reshape(-1) + 1, flat) <= self.threshold
+            near = near & torch.isfinite(flat).all(-1)
+            following["truncated"] = following["truncated"] | ~near.reshape(*batch, 1)
         following["done"] = following["terminated"] | following["truncated"]
         following["reward"] = -cost.reshape(*batch, 1)
         return following

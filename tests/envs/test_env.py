@@ -214,3 +214,81 @@ def test_a_given_split_and_task_are_flown(system):
     task = make_task(system, steps=17)
     assert make_env(system, task=task, episodes=2).task is task
     assert make_env(system, task=task.sets[-1], episodes=2).task.set == task.sets[-1]
+
+
+def training_env(system, tasks, size=200, **options):
+    """Starts anywhere, and cuts off who strays 1 m (rad) from the reference."""
+    return TrackingEnv(make_dynamics(system), *tasks[system], (size,), anywhere=True, threshold=1.0, **options)
+
+
+@pytest.mark.parametrize("batch_size", [(), (3,)], ids=["single", "batch"])
+def test_the_specs_hold_where_episodes_start_anywhere_and_are_cut_off(system, batch_size):
+    task = make_task(system)
+    episodes = task.episodes(5, "train", 0)
+    check_env_specs(TrackingEnv(make_dynamics(system), task, episodes, batch_size, anywhere=True, threshold=0.2))
+
+
+def test_an_episode_that_starts_anywhere_is_on_its_reference_at_that_step(system, tasks):
+    env, (task, episodes) = training_env(system, tasks), tasks[system]
+    now = env.reset()
+    assert set(now["step"].flatten().tolist()) == set(range(task.steps))
+    rows, step = episodes[now["episode"].squeeze(-1)], now["step"].squeeze(-1)
+    torch.testing.assert_close(now["state"], task.start(rows, step))
+    assert not now["diverged"].any()
+    assert not torch.equal(env.reset()["step"], now["step"])
+
+
+def test_an_episode_that_would_have_arrived_starts_at_its_beginning():
+    task = make_task("fixed_wing")
+    env = TrackingEnv(make_dynamics("fixed_wing"), task, task.episodes(5, "train", 0), (400,), anywhere=True)
+    now = env.reset()
+    rows, step = env.episodes[now["episode"].squeeze(-1)], now["step"].squeeze(-1)
+    assert not task.arrived(rows, step, now["state"]).any()
+    assert 80 < step.max() < 90  # 50 m at 11.5 m/s and a little more for the way sideways
+    assert (step == 0).float().mean() > 0.15  # the others of 120 steps
+
+
+def strayed(system, tasks, metres):
+    """An environment and its next TensorDict for robots that are moved off by some distance while at step 2."""
+    task, episodes = tasks[system]
+    env = training_env(system, tasks, size=4)
+    step = torch.full((4, 1), 2)
+    state = task.start(episodes[:4], step.squeeze(-1))
+    axis = {"cartpole": 2}.get(system, 1)  # the pole's angle, or a position to the side
+    env.dynamics = lambda state, action: state + metres * torch.eye(state.shape[-1], dtype=state.dtype)[axis]
+    now = env.reset(TensorDict({"state": state, "episode": torch.arange(4)[:, None], "step": step}, 4), set_state=True)
+    now["action"] = torch.zeros(4, len(task.system.Action._fields), dtype=torch.float64)
+    return env, now
+
+
+@pytest.mark.parametrize(("metres", "cut_off"), [(0.0, False), (0.15, False), (0.25, True), (float("nan"), True)])
+def test_who_strays_beyond_the_threshold_is_cut_off_and_one_within_it_goes_on(system, tasks, metres, cut_off):
+    size = 1 if system == "cartpole" else 4  # a quadrotor's reference itself moves by some decimetres in a step
+    env, now = strayed(system, tasks, size * metres)
+    env.threshold = size * 0.2
+    following = env.step(now)["next"]
+    assert following["truncated"].all() == cut_off == following["truncated"].any()
+    assert following["done"].all() == cut_off
+    env.threshold = None
+    assert not env.step(now)["next", "truncated"].any()
+
+
+def test_a_robot_whose_rates_are_not_numbers_is_cut_off_although_it_is_in_its_place(system, tasks):
+    env, now = strayed(system, tasks, 0.0)
+    still = env.dynamics
+    env.dynamics = lambda state, action: (
+        still(state, action) * torch.tensor([1.0] * (state.shape[-1] - 1) + [torch.nan])
+    )
+    assert env.step(now)["next", "truncated"].all()
+
+
+def test_who_is_cut_off_is_put_back_on_a_reference_at_a_random_step(system, tasks):
+    env, now = strayed(system, tasks, 10.0)
+    task, episodes = tasks[system]
+    drawn = []
+    for _ in range(30):
+        _, fresh = env.step_and_maybe_reset(now.clone())
+        rows, step = episodes[fresh["episode"].squeeze(-1)], fresh["step"].squeeze(-1)
+        torch.testing.assert_close(fresh["state"], task.start(rows, step))
+        drawn += step.tolist()
+    assert set(drawn) == set(range(task.steps))
