@@ -292,7 +292,7 @@ def said(options):
     words = ["python -m adapt.pretrain"]
     for item in fields(options):
         value = getattr(options, item.name)
-        if value != item.default and item.name not in UNNAMED:
+        if (value != item.default or item.name in ("system", "seed")) and item.name not in UNNAMED:
             flag = f"--{item.name.replace('_', '-')}"
             values = value if isinstance(value, tuple) else (value,)
             words += [flag] if value is True else [f"{flag} {part}" for part in values]

@@ -124,7 +124,9 @@ def _evaluation_row(metrics):
     row |= {"target": " ".join(options["target"]), "method": metrics["method"], "policy": options["policy"] or ""}
     row |= {"solver": info.get("solver", "") + (", compiled" if info.get("compile") else "")}
     row |= {"horizon": metrics["horizon"], "trained_in": info.get("trained_in", info.get("model", ""))}
-    row |= {"samples": info.get("samples", ""), "seed": info.get("seed", metrics["seed"])}
+    # Runs from scratch that differ in their best update only are of one group; budgets in a target tell runs apart.
+    row |= {"samples": "" if info.get("finetuned") is False else info.get("samples", "")}
+    row |= {"seed": info.get("seed", metrics["seed"])}
     row |= _figures("error", metrics)
     keys = ("calls", "failures", "metric", "unit", "median_ms", "p99_ms", "threads", "torch", "commit")
     return row | {key: metrics.get(key) for key in keys}

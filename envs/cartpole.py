@@ -131,6 +131,7 @@ class Balance(Task):
     reference_names: ClassVar[tuple[str, ...]] = State._fields
     state_weights: ClassVar[dict[str, float]] = {"theta": 10.0, "v": 3.0, "omega": 1.0}
     action_weights: ClassVar[dict[str, float]] = {}
+    rewarded: ClassVar[int] = -1  # rest: the rows before it begin where the robot is and ask for little
     sets: ClassVar[tuple[str, ...]] = ("balance",)
     encoder: ClassVar[str] = "none"
     layers: ClassVar[tuple[int, ...]] = (32, 64, 64, 32)

@@ -18,7 +18,7 @@ class TrackingEnv(EnvBase):
     | `window`      | (*B, H, w)| what a policy sees of the reference                      |
     | `reference`   | (*B, H, r)| where the next H states should be; planners read it      |
     | `action`      | (*B, m)   | in [-1, 1]                                               |
-    | `reward`      | (*B, 1)   | minus the task's cost of the step                        |
+    | `reward`      | (*B, 1)   | minus the task's cost of the step, see `Task.rewarded`   |
     | `terminated`  | (*B, 1)   | diverged, or arrived                                     |
     | `diverged`    | (*B, 1)   | failed                                                   |
 
@@ -114,7 +114,7 @@ class TrackingEnv(EnvBase):
         rows, before = self.episodes[episode.reshape(-1)], tensordict["state"]
         state = self.dynamics(before, action)
         flat = state.reshape(-1, state.shape[-1])
-        goal = self.task.reference(rows, step.reshape(-1), before.reshape(flat.shape))[:, 0]
+        goal = self.task.reference(rows, step.reshape(-1), before.reshape(flat.shape))[:, self.task.rewarded]
         cost = self.task.cost(flat, action.reshape(-1, action.shape[-1]), goal)
         following = self._described(state, episode, step + 1)
         arrived = self.task.arrived(rows, step.reshape(-1) + 1, flat).reshape(*batch, 1)

@@ -125,6 +125,7 @@ class Task(ABC):
     reference_names: ClassVar[tuple[str, ...]]  # states that the reference prescribes; the others are wanted at zero
     state_weights: ClassVar[dict[str, float]]
     action_weights: ClassVar[dict[str, float]]  # on the squared distance from the trim action
+    rewarded: ClassVar[int] = 0  # row of the reference that the reward of a single step is about: the next state's own
     sets: ClassVar[tuple[str, ...]]  # names of the families of episodes; the first is the default
     reads_waypoints: ClassVar[bool] = False  # whether `set` may name a CSV file
     encoder: ClassVar[str]  # how a policy reads the reference: "conv", "linear" or "none"

@@ -43,10 +43,9 @@ class Config:
     planner: PlannerConfig | None = None  # None: the one that the network brings, or the default
 
     def __post_init__(self):
-        for name in ("samples", "rounds"):
-            if not getattr(self, name) >= 1:
-                raise InputError(f"--{name} {getattr(self, name)}: expected at least 1")
-        for name in ("members", "width", "layers", "episodes", "every", "validations"):
+        if not self.samples >= 1:
+            raise InputError(f"--samples {self.samples}: expected at least 1")
+        for name in ("rounds", "members", "width", "layers", "episodes", "every", "validations"):
             if not getattr(self, name) >= 1:
                 raise InputError(f"pets.Config.{name} {getattr(self, name)}: expected at least 1")
         for name in ("first_std", "exploration"):

@@ -92,7 +92,7 @@ def _called(name):
 
 
 PRESETS = {
-    "cartpole": Config(),
+    "cartpole": Config(discount=0.95, final_exploration=0.01),
     "quadrotor": Config(),
     "fixed_wing": Config(),
 }
@@ -196,7 +196,8 @@ def train(run, dynamics, task, banks, config):
         dynamics: what is flown.
         banks: training episodes of each speed of the curriculum, slowest first.
     """
-    parts = joined(run.network, dynamics, task, banks[0], config)
+    with torch.random.fork_rng():  # TorchRL tries the policy out
+        parts = joined(run.network, dynamics, task, banks[0], config)
     while run.update < config.updates:
         share = run.update / config.updates
         threshold, bank = stage(config, task, len(banks), run.update)

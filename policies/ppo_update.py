@@ -59,7 +59,7 @@ def joined(network, dynamics, task, episodes, config):
     return Parts(
         env,
         collector,
-        GAE(gamma=config.discount, lmbda=config.trace, value_network=critic, average_gae=True, deactivate_vmap=True),
+        GAE(gamma=config.discount, lmbda=config.trace, value_network=critic, deactivate_vmap=True),
         ClipPPOLoss(policy, critic, **settings),
         memory,
     )
@@ -85,11 +85,8 @@ def judge(flown, network, parts, config):
     """
     following, done = flown["next"], flown["next", "done"]
     cost = -following["reward"]
-    finite = torch.isfinite(cost)
-    mean = cost[finite].mean() if finite.any() else network.unit
-    network.unit.copy_(torch.where(network.unit > 0, 0.95 * network.unit + 0.05 * mean, mean))
-    unit = torch.where(network.unit > 0, network.unit, torch.ones_like(network.unit))
-    scaled = torch.where(finite, cost / unit, torch.full_like(cost, WORST)).clamp(max=WORST)
+    mean = _set_unit(network.unit, cost)
+    scaled = (cost / network.unit).nan_to_num(nan=WORST).clamp(max=WORST)
     following["reward"] = -(1 - config.discount) * scaled  # values are of order one
     for key in network.critic_keys:
         here, there = flown[key], following[key]
@@ -98,7 +95,21 @@ def judge(flown, network, parts, config):
     following["terminated"] = torch.zeros_like(done)
     with torch.no_grad():
         parts.advantage(flown)
+    advantage = flown["advantage"]
+    flown["advantage"] = (advantage - advantage.mean()) / advantage.std(correction=0).clamp(min=1e-6)
     return {"cost": float(mean), "reward": -float(mean), "resets": float(strayed.float().mean())}
+
+
+def _set_unit(unit, cost):
+    """Let the unit follow the mean cost of a step, no step of which counts for more than the worst; returns that."""
+    cost = cost[torch.isfinite(cost)]
+    if not len(cost):
+        unit.clamp_(min=1e-6)
+        return unit
+    fresh = not unit > 0
+    mean = cost.clamp(max=WORST * (cost.median() if fresh else unit)).mean()
+    unit.copy_((mean if fresh else 0.95 * unit + 0.05 * mean).clamp(min=1e-6))
+    return mean
 
 
 def improve(flown, run, parts, config, fall):

@@ -90,7 +90,7 @@ def test_the_gradient_through_a_rollout_is_that_through_a_plain_loop(system, tar
         reference = task.reference(rows, step, state)
         action = act(task.observe(state), task.window(state, reference))
         state, step = dynamics(state, action), step + 1
-        cost = cost + task.cost(state, action, reference[:, 0]).sum()
+        cost = cost + task.cost(state, action, reference[:, task.rewarded]).sum()
     torch.testing.assert_close(flown["next", "reward"].sum(), -cost)
     for parameter, expected in zip(parameters, torch.autograd.grad(-cost, parameters), strict=True):
         assert expected.abs().max() > 0
@@ -104,11 +104,26 @@ def test_a_step_is_the_dynamics_and_the_reward_minus_the_cost_against_the_next_r
     following = env.step(now)["next"]
     expected = make_dynamics(system, "drag=0.3")(now["state"], now["action"])
     torch.testing.assert_close(following["state"], expected)
-    goal = task.reference(episodes[now["episode"].squeeze(-1)], torch.zeros(3, dtype=torch.long), now["state"])[:, 0]
+    goal = task.reference(episodes[now["episode"].squeeze(-1)], torch.zeros(3, dtype=torch.long), now["state"])[
+        :, task.rewarded
+    ]
     torch.testing.assert_close(following["reward"], -task.cost(expected, now["action"], goal).unsqueeze(-1))
     assert (following["step"] == 1).all()
     assert torch.equal(following["episode"], now["episode"])
     torch.testing.assert_close(following["observation"], task.observe(expected))
+
+
+def test_the_reward_of_a_cart_at_rest_is_the_best_and_one_that_only_slows_down_is_not_at_its_goal():
+    env = make_env("cartpole")
+    now = env.reset()
+    rewards = []
+    for speed in (0.0, 0.1):
+        now["state"], now["action"] = torch.tensor([0.0, speed, 0.0, 0.0]), torch.zeros(1)
+        rewards.append(env.step(now.clone())["next", "reward"].item())
+    assert rewards[0] == 0
+    assert rewards[1] == pytest.approx(
+        -3 * 0.1**2, rel=0.05
+    )  # the weight of the speed: all of it counts, not the tenth
 
 
 def test_reset_starts_episodes_at_random_or_those_it_is_given(system, tasks):

@@ -321,7 +321,7 @@ def test_a_few_hundred_transitions_are_enough_to_balance_a_pole():
     ("changes", "message"),
     [
         ({"samples": 0}, "--samples 0: expected at least 1"),
-        ({"rounds": 0}, "--rounds 0: expected at least 1"),
+        ({"rounds": 0}, "pets.Config.rounds 0: expected at least 1"),
         *(({name: 0}, f"{name} 0: expected at least 1") for name in ("members", "width", "layers", "episodes")),
         *(({name: 0}, f"{name} 0: expected at least 1") for name in ("every", "validations")),
         ({"exploration": -0.1}, "exploration -0.1: expected 0 or more"),

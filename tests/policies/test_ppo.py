@@ -26,14 +26,14 @@ def name(request):
 
 
 @lru_cache
-def setting(name, config=TINY):
+def setting(name):
     """A task, its dynamics, and few training episodes at each speed."""
     task = make_task(name, horizon=3)
-    return task, make_dynamics(name), training_banks(task, config, 0)
+    return task, make_dynamics(name), training_banks(task, TINY, 0)
 
 
 def begun(name, config=TINY, seed=0, network=None):
-    task, dynamics, banks = setting(name, config)
+    task, dynamics, banks = setting(name)
     return ppo.begin(dynamics, task, banks, config, seed, network), (dynamics, task, banks, config)
 
 
@@ -111,7 +111,7 @@ def test_the_density_of_an_action_integrates_to_one():
         run.network.policy.log_scale.fill_(-0.7)
         run.network.policy.head.bias.fill_(0.4)
     actor = ppo_update.joined(run.network, dynamics, task, banks[0], config).loss.actor_network
-    now = run.network.normalise and seen("cartpole", 1)
+    now = seen("cartpole", 1)
     action = torch.linspace(-1, 1, 20001)[1:-1]
     with torch.no_grad():
         density = actor.get_dist(now).log_prob(action[:, None, None]).exp().squeeze(-1)
@@ -154,6 +154,7 @@ def test_without_a_width_the_layers_are_those_of_the_paper():
     assert sorted(sizes) == sorted([(4, 32), (32, 64), (64, 64), (64, 32), (32, 1)])
 
 
+@pytest.mark.parametrize("name", ["cartpole", "fixed_wing"])
 def test_observations_are_normalised_to_what_random_actions_in_the_nominal_robot_show(name):
     counting = Counting(make_dynamics(name, "gravity=x0.9" if name == "cartpole" else "drag=0.3"))
     task, nominal, banks = setting(name)
@@ -201,16 +202,18 @@ def test_value_targets_are_the_weighted_returns_and_an_end_is_worth_what_the_sta
             gain = error + (0.0 if ended else TINY.discount * TINY.trace * gain)
             target[row, step] = value[row, step] + gain
     torch.testing.assert_close(flown["value_target"], target, rtol=1e-4, atol=1e-4)
-    advantage = (target - value - (target - value).mean()) / (target - value).std()
+    advantage = (target - value - (target - value).mean()) / (target - value).std(correction=0)
     torch.testing.assert_close(flown["advantage"], advantage, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.parametrize("name", ["cartpole", "quadrotor"])
 def test_the_unit_is_the_mean_cost_of_a_step(name):
     run, before, _, metrics = judged(name)
     mean = -float(before["next", "reward"].mean())
     assert float(run.network.unit) == pytest.approx(mean, rel=1e-5)
     assert metrics["cost"] == pytest.approx(mean, rel=1e-5) == -metrics["reward"]
-    assert metrics["resets"] == pytest.approx(float(before["next", "truncated"].float().mean()))
+    strayed = before["next", "truncated"] & (before["next", "step"] < setting(name)[0].steps)
+    assert 0 < metrics["resets"] == pytest.approx(float(strayed.float().mean()))
 
 
 def test_a_flight_that_costs_the_same_everywhere_is_worth_the_same_whether_or_not_it_ends():
@@ -242,7 +245,7 @@ def test_a_cost_that_is_not_finite_or_beyond_all_measure_counts_as_a_hundred_mea
         flown["next", "state"][1, 2] = torch.nan
         flown["next", "done"][1, 2] = True
 
-    run, before, flown, _ = judged("quadrotor", broken)
+    _, _, flown, _ = judged("quadrotor", broken)
     assert float(flown["next", "reward"][1, 2]) == pytest.approx(-100 * (1 - TINY.discount))
     assert torch.isfinite(flown["advantage"]).all()
     assert flown["advantage"][1, 2] == flown["advantage"].min()
@@ -266,11 +269,10 @@ def improved(config, advantage, epochs=1):
 
 
 def test_an_update_makes_better_actions_likelier_and_worse_ones_less_likely():
-    advantage = torch.ones(4, 6, 1)
-    advantage[:2] = -1
-    config = replace(TINY, learning_rate=1e-3, epochs=2, minibatches=1)
+    advantage = torch.randn(4, 6, 1, generator=torch.Generator().manual_seed(0))
+    config = replace(TINY, learning_rate=1e-3, target_kl=10.0, epochs=5, minibatches=1)
     *_, change = improved(config, advantage)
-    assert change[2:].mean() > 0.005 > -0.005 > change[:2].mean()
+    assert float((change * advantage.squeeze(-1)).mean()) > 0.01
 
 
 def test_the_learning_rate_follows_the_divergence_and_an_update_that_moved_too_far_ends():
@@ -295,24 +297,25 @@ def test_minibatches_without_a_finite_gradient_are_left_out_and_counted():
     assert all(math.isfinite(value) for value in metrics.values())
 
 
-class FailsOnce:
-    """Dynamics whose prediction for the first robot is not a number in one call."""
+class Failing:
+    """Dynamics whose prediction for the first robots is not a number in some calls."""
 
-    def __init__(self, dynamics, call, rows=1):
-        self.dynamics, self.left, self.rows, self.system = dynamics, call, rows, dynamics.system
+    def __init__(self, dynamics, calls, rows):
+        self.dynamics, self.calls, self.rows, self.system = dynamics, calls, rows, dynamics.system
+        self.call = 0
 
     def __call__(self, state, action):
-        self.left -= 1
+        self.call += 1
         following = self.dynamics(state, action)
-        if self.left == 0:
+        if self.call in self.calls:
             following[: self.rows] = torch.nan
         return following
 
 
-@pytest.mark.parametrize("rows", [1, 4])
+@pytest.mark.parametrize(("name", "rows"), [("cartpole", 4), ("fixed_wing", 1)])
 def test_a_robot_that_is_not_a_number_is_put_back_and_training_goes_on(name, rows):
     run, (dynamics, task, banks, config) = begun(name)
-    history = list(ppo.train(run, FailsOnce(dynamics, 9, rows), task, banks, config))
+    history = list(ppo.train(run, Failing(dynamics, {9}, rows), task, banks, config))
     assert len(history) == config.updates
     assert run.skipped == 0
     assert torch.isfinite(weights_of(run)).all()
@@ -321,15 +324,15 @@ def test_a_robot_that_is_not_a_number_is_put_back_and_training_goes_on(name, row
 
 
 def test_dynamics_that_never_give_a_number_neither_break_the_policy_nor_the_run():
-    run, (_, task, banks, config) = begun("quadrotor")
-    history = list(ppo.train(run, lambda state, action: state * torch.nan, task, banks, config))
-    assert [row["resets"] for row in history] == [1.0] * config.updates
+    run, (dynamics, task, banks, config) = begun("quadrotor")
+    history = list(ppo.train(run, Failing(dynamics, range(1000), 4), task, banks, config))
+    assert min(row["resets"] for row in history) > 0.9  # the others ended by the clock
     assert torch.isfinite(weights_of(run)).all()
 
 
 def test_within_seconds_training_makes_the_cost_of_unseen_flights_a_tenth():
     task, dynamics = make_task("cartpole", steps=50), make_dynamics("cartpole")
-    config = replace(ppo.PRESETS["cartpole"], samples=60_000, batch=64, width=32, episodes=200)
+    config = ppo.Config(samples=40_000, batch=128, steps=8, learning_rate=3e-3, width=32, episodes=200)
     banks = training_banks(task, config, 0)
     run = ppo.begin(dynamics, task, banks, config, 0)
     env = make_env("cartpole", task=task, batch_size=(20,), episodes=20, split="validation")
@@ -338,7 +341,7 @@ def test_within_seconds_training_makes_the_cost_of_unseen_flights_a_tenth():
     def cost():
         options = {"tensordict": start.clone(), "auto_reset": False, "break_when_any_done": False}
         with torch.no_grad():
-            return -float(env.rollout(25, ppo.actor(run.network, task), **options)["next", "reward"].mean())
+            return -float(env.rollout(50, ppo.actor(run.network, task), **options)["next", "reward"].mean())
 
     before = cost()
     list(ppo.train(run, dynamics, task, banks, config))
@@ -351,7 +354,7 @@ def test_within_seconds_training_makes_the_cost_of_unseen_flights_a_tenth():
 @pytest.mark.parametrize("samples", [1, 1000, 1001, 4999])
 def test_no_more_transitions_are_taken_than_the_budget_and_all_are_counted(samples):
     config = replace(ppo.FINETUNE, samples=samples, width=8, episodes=6, epochs=1)
-    task, dynamics, banks = setting("cartpole", TINY)
+    task, dynamics, banks = setting("cartpole")
     counting = Counting(dynamics)
     run = ppo.begin(counting, task, banks, config, 0)
     history = list(ppo.train(run, counting, task, banks, config))
@@ -365,7 +368,7 @@ def test_any_budget_lasts_for_several_updates_and_is_nearly_used_up():
         for config in (ppo.FINETUNE, *ppo.PRESETS.values()):
             config = replace(config, samples=samples)
             used = config.updates * config.collected
-            assert 0.9 * samples <= used <= samples or samples < 100 and 0 < used <= samples
+            assert 0.9 * samples <= used <= samples or (samples < 100 and 0 < used <= samples)
             assert config.updates >= 10 or samples < 160
             assert config.side_by_side <= config.batch
 
@@ -409,11 +412,11 @@ def test_exploration_narrows_from_its_first_to_its_last_bound():
 # --- repeating and continuing ----------------------------------------------------------------------------------------
 
 
-def test_the_same_seed_gives_the_same_weights_and_another_seed_others(name):
-    one, history = finished(name)
+def test_the_same_seed_gives_the_same_weights_and_another_seed_others():
+    one, history = finished("fixed_wing")
     torch.manual_seed(99)  # global state must not matter
-    two, again = finished(name)
-    other, _ = finished(name, seed=1)
+    two, again = finished("fixed_wing")
+    other, _ = finished("fixed_wing", seed=1)
     assert torch.equal(weights_of(one), weights_of(two))
     assert history == again
     assert not torch.equal(weights_of(one), weights_of(other))
@@ -426,7 +429,7 @@ def test_training_leaves_the_global_random_state_alone():
         assert torch.equal(torch.get_rng_state(), before)
 
 
-@pytest.mark.parametrize("stopped_at", [1, 3])
+@pytest.mark.parametrize(("name", "stopped_at"), [("cartpole", 2), ("quadrotor", 3)])
 def test_a_resumed_run_ends_bit_for_bit_where_an_uninterrupted_one_does(name, stopped_at):
     config = replace(TINY, samples=6 * 24)
     whole, history = finished(name, config)
@@ -452,10 +455,10 @@ def test_fine_tuning_goes_on_with_a_copy_in_the_same_units():
     config = replace(ppo.finetuning(TINY), samples=200, episodes=6)
     tuned, (_, task, banks, _) = begun("quadrotor", config, network=run.network)
     assert torch.equal(weights_of(tuned), before)
+    assert float(tuned.network.unit) == unit > 0
     list(ppo.train(tuned, make_dynamics("quadrotor", "drag=0.3"), task, banks, config))
     assert torch.equal(weights_of(run), before)
     assert not torch.equal(weights_of(tuned), before)
-    assert float(tuned.network.unit) == pytest.approx(unit, rel=0.9)
     scale = tuned.network.policy.trunk.layers.observation_scale
     assert torch.equal(scale, run.network.policy.trunk.layers.observation_scale)
 
@@ -482,6 +485,7 @@ class Plain(nn.Module):
         self.register_buffer("unit", torch.zeros(()))
 
 
+@pytest.mark.parametrize("name", ["cartpole", "fixed_wing"])
 def test_any_network_with_the_same_interface_is_trained(name):
     task = setting(name)[0]
     network = Plain(len(task.system.State._fields), len(task.system.Action._fields))
