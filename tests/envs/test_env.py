@@ -97,7 +97,7 @@ def test_the_gradient_through_a_rollout_is_that_through_a_plain_loop(system, tar
         torch.testing.assert_close(parameter.grad, expected)
 
 
-def test_a_step_is_the_dynamics_and_the_reward_minus_the_cost_against_the_next_reference_point(system, tasks, draw):
+def test_a_step_is_the_dynamics_and_the_reward_minus_the_cost_against_the_rewarded_reference_point(system, tasks, draw):
     env, (task, episodes) = short_env(system, tasks, "drag=0.3"), tasks[system]
     now = env.reset()
     now["action"] = draw(task.system, 3)[1]
