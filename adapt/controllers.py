@@ -6,6 +6,7 @@ from adapt import command
 from envs.errors import InputError
 from policies import METHODS, pick_method
 
+SOLVER = "fatrop"  # that a planner uses unless another is asked for
 SAMPLES = 1000  # transitions that the residual of a planner is fitted to unless another number is asked for
 
 
@@ -75,7 +76,7 @@ def obtain(options, system, vehicle, target, device="cpu"):
         return Controller(policy.actor(options.seed), task, policy.info)
     task = make_task(system, options.set, **({"horizon": options.horizon} if options.horizon is not None else {}))
     model, info = _model(method.model, options, system, vehicle, target)
-    settings = {"compile": options.compile} | ({"solver": options.solver} if options.solver else {})
+    settings = {"compile": options.compile, "solver": options.solver or SOLVER}
     return Controller(method.module.actor(model, task, **settings), task, {"model": method.model, **settings, **info})
 
 
