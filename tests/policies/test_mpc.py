@@ -40,7 +40,7 @@ class Push(NamedTuple):
 
 @dataclass(frozen=True)
 class Cart(System):
-    """A double integrator: RK4 solves it exactly, so a step is x' = A x + B u."""
+    """A double integrator on a slope: RK4 solves it exactly, so a step is x' = A x + B (u - trim)."""
 
     name: ClassVar[str] = "cart"
     State: ClassVar[type] = Where
@@ -49,9 +49,14 @@ class Cart(System):
     residual_input_names: ClassVar[tuple[str, ...]] = ("velocity",)
     dt: float = 0.2
     gain: float = 3.0  # [m/s^2]
+    slope: float = 0.3  # [-] what holds it
+
+    @property
+    def trim_action(self):
+        return Push(self.slope)
 
     def derivative(self, x, u):
-        return Where(x.velocity, self.gain * u.force)
+        return Where(x.velocity, self.gain * (u.force - self.slope))
 
     def velocity(self, x):
         return x.velocity, 0, 0
@@ -125,10 +130,10 @@ def test_on_a_linear_system_it_is_the_linear_quadratic_regulator(solver):
         mpc.reset()
         state = torch.tensor([where], dtype=torch.float64)
         action = mpc(parked(where, at=at))["action"]
-        assert action.item() == pytest.approx(-(gains[0] @ (state[0].numpy() - [at, 0])).item(), abs=1e-4)
+        assert action.item() == pytest.approx(0.3 - (gains[0] @ (state[0].numpy() - [at, 0])).item(), abs=1e-4)
         actions, states = mpc.plan()
         before = np.concatenate((state.numpy(), states[:-1]))  # the whole plan is the feedback along itself
-        expected = [-(gain @ (x - [at, 0])).item() for gain, x in zip(gains, before, strict=True)]
+        expected = [0.3 - (gain @ (x - [at, 0])).item() for gain, x in zip(gains, before, strict=True)]
         assert actions.ravel() == pytest.approx(expected, abs=1e-4)
 
 
@@ -188,7 +193,7 @@ def test_a_real_time_iteration_is_one_quadratic_program():
     parameters = np.concatenate(([0.1, 0.2], np.zeros(task.horizon)))
     found = solver.solve(np.zeros(3 * task.horizon), parameters, warm=True)
     assert len(count) == 1
-    assert found[0] == pytest.approx(-(lqr_gains(task.system, task)[0] @ [0.1, 0.2]).item(), abs=1e-6)
+    assert found[0] == pytest.approx(0.3 - (lqr_gains(task.system, task)[0] @ [0.1, 0.2]).item(), abs=1e-6)
 
 
 @pytest.mark.parametrize("reason", ["GAP", "RESIDUAL"])
@@ -330,7 +335,7 @@ def test_a_state_that_is_not_finite_or_far_from_any_robot_is_counted_and_harms_n
 
 def test_a_reference_that_is_not_finite_is_counted():
     mpc = MPC(Dynamics(Cart()), Park())
-    assert mpc(parked([1.0, 0.0], at=float("nan")))["action"].item() == 0
+    assert mpc(parked([1.0, 0.0], at=float("nan")))["action"].item() == 0.3
     assert mpc.failures == 1
 
 
@@ -338,8 +343,8 @@ def test_a_row_that_is_done_is_not_solved():
     mpc = MPC(Dynamics(Cart()), Park())
     given = parked([1.0, 0.0], [1.0, 0.0]).set("done", torch.tensor([[True], [False]]))
     action = mpc(given)["action"]
-    assert action[0] == 0
-    assert action[1] != 0
+    assert action[0] == 0.3
+    assert action[1] != 0.3
     assert mpc.calls == 1
 
 
@@ -507,7 +512,7 @@ def test_real_time_iterations_do_without_hpipm(monkeypatch):
     mpc, gains = MPC(Dynamics(task.system), task, "rti"), lqr_gains(task.system, task)
     for _ in range(2):
         action = mpc(parked([0.1, -0.2]))["action"].item()
-        assert action == pytest.approx(-(gains[0] @ [0.1, -0.2]).item(), abs=1e-4)
+        assert action == pytest.approx(0.3 - (gains[0] @ [0.1, -0.2]).item(), abs=1e-4)
 
 
 def test_what_it_cannot_plan_for_is_refused():
