@@ -46,6 +46,7 @@ class Config:
     exploration: float = 0.5  # standard deviation of the actions before the tanh
     final_exploration: float = 0.1
     norm: float = 1.0  # gradients of a larger norm are scaled down to it
+    anywhere: bool = True  # whether later flights, as the first, start at any step of their reference
     curriculum: float = 0.5  # [-] share of the updates after which the last threshold and speed are reached
     episodes: int = 4000  # training episodes drawn
 
@@ -198,6 +199,7 @@ def train(run, dynamics, task, banks, config):
     """
     with torch.random.fork_rng():  # TorchRL tries the policy out
         parts = joined(run.network, dynamics, task, banks[0], config)
+    parts.env.anywhere = config.anywhere
     while run.update < config.updates:
         share = run.update / config.updates
         threshold, bank = stage(config, task, len(banks), run.update)

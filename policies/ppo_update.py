@@ -104,7 +104,6 @@ def _set_unit(unit, cost):
     """Let the unit follow the mean cost of a step, no step of which counts for more than the worst; returns that."""
     cost = cost[torch.isfinite(cost)]
     if not len(cost):
-        unit.clamp_(min=1e-6)
         return unit
     fresh = not unit > 0
     mean = cost.clamp(max=WORST * (cost.median() if fresh else unit)).mean()

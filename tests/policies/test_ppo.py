@@ -388,6 +388,24 @@ def test_training_follows_the_curriculum_and_who_strays_is_put_back_within_it():
     assert history[0]["resets"] > 0
 
 
+def test_robots_fly_on_from_where_they_are_and_those_whose_flight_has_ended_from_another_place():
+    run, (dynamics, task, banks, config) = begun("cartpole")
+    parts = ppo_update.joined(run.network, dynamics, task, banks[0], config)
+    parts.env.threshold = 0.1
+    ended = 0
+    for seed in range(20):
+        place = run.place.clone()
+        flown = ppo_update.fly(run, parts, seed)
+        assert all(torch.equal(flown[:, 0][key], place[key]) for key in place.keys())  # noqa: SIM118
+        torch.testing.assert_close(flown["next", "state"], dynamics(flown["state"], flown["action"]))
+        last, done = flown["next", "state"][:, -1], flown["next", "done"][:, -1].squeeze(-1)
+        assert torch.equal(run.place["state"][~done], last[~done])
+        fresh = banks[0][run.place["episode"].squeeze(-1)]
+        assert torch.equal(run.place["state"][done], fresh[done])  # a pole's episode is its first state
+        ended += int(done.sum())
+    assert 0 < ended < 80
+
+
 def test_a_faster_bank_is_entered_on_its_own_reference_at_the_same_step():
     run, (_, task, banks, _) = begun("quadrotor")
     place = run.place.clone()
