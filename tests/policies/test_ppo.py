@@ -353,7 +353,7 @@ def test_within_seconds_training_makes_the_cost_of_unseen_flights_a_tenth():
 
 @pytest.mark.parametrize("samples", [1, 1000, 1001, 4999])
 def test_no_more_transitions_are_taken_than_the_budget_and_all_are_counted(samples):
-    config = replace(ppo.FINETUNE, samples=samples, width=8, episodes=6, epochs=1)
+    config = replace(ppo.finetuning(TINY), samples=samples, batch=128, steps=16, least_updates=10, epochs=1)
     task, dynamics, banks = setting("cartpole")
     counting = Counting(dynamics)
     run = ppo.begin(counting, task, banks, config, 0)
@@ -365,7 +365,7 @@ def test_no_more_transitions_are_taken_than_the_budget_and_all_are_counted(sampl
 
 def test_any_budget_lasts_for_several_updates_and_is_nearly_used_up():
     for samples in (1, 2, 15, 16, 17, 100, 1000, 1001, 5000, 150_000, 1_500_000):
-        for config in (ppo.FINETUNE, *ppo.PRESETS.values()):
+        for config in (*map(ppo.finetuning, ppo.PRESETS.values()), *ppo.PRESETS.values()):
             config = replace(config, samples=samples)
             used = config.updates * config.collected
             assert 0.9 * samples <= used <= samples or (samples < 100 and 0 < used <= samples)
@@ -470,7 +470,7 @@ def test_a_resumed_run_ends_bit_for_bit_where_an_uninterrupted_one_does(name, st
 def test_fine_tuning_goes_on_with_a_copy_in_the_same_units():
     run, _ = finished("quadrotor")
     before, unit = weights_of(run).clone(), float(run.network.unit)
-    config = replace(ppo.finetuning(TINY), samples=200, episodes=6)
+    config = replace(ppo.finetuning(TINY), samples=200)
     tuned, (_, task, banks, _) = begun("quadrotor", config, network=run.network)
     assert torch.equal(weights_of(tuned), before)
     assert float(tuned.network.unit) == unit > 0
@@ -527,7 +527,7 @@ def test_any_network_with_the_same_interface_is_trained(name):
         ("clip", float("inf"), "ppo.Config.clip inf: expected more than 0"),
         ("curriculum", 1.5, "--curriculum 1.5: expected between 0 and 1"),
         ("discount", 1.0, "ppo.Config.discount 1: expected less than 1"),
-        ("exploration", 0.01, "--exploration 0.01: expected at least 0.1, the last"),
+        ("exploration", 0.01, "--exploration 0.01: expected at least 0.06, the last"),
         ("exploration", 0.0, "--exploration 0.0: expected more than 0"),
     ],
 )
