@@ -10,18 +10,16 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from adapt import residual as residuals
-from adapt.flying import collect
+from adapt.flying import collect, film_transitions, filmed
 from adapt.prediction import prediction_error
 from adapt.residual_dynamics import ResidualDynamics
 from adapt.transitions import Transitions
 from envs.dynamics import Dynamics
-from envs.env import TrackingEnv
 from envs.errors import InputError
-from policies import apg
-from policies.apg import FINETUNE
+from envs.pixels import tracking_env
+from policies import METHODS
 from policies.checkpoints import Policy
 from policies.evaluate import Evaluation, evaluate, test_episodes
-from policies.networks import as_actor
 
 HELD_OUT = 1000  # transitions flown for the report alone, to measure the prediction error
 
@@ -41,30 +39,40 @@ class Adaptation:
     oracle: Policy | None = None
 
 
-def finetune(policy, dynamics, config=FINETUNE, seed=0, progress=None):
+def finetuning(policy):
+    """The settings that a policy is fine-tuned with unless others are asked for."""
+    method = METHODS[policy.method].module
+    return method.finetuning(method.PRESETS.get(policy.task.system.name, method.Config()))
+
+
+def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None):
     """Continue the training of a policy in other dynamics; the given policy stays as it is.
 
     Args:
         dynamics: anything that is differentiable, such as a fitted residual.
+        config: of the policy's method; None is `finetuning(policy)`.
         progress: wraps the iterable of updates, as `tqdm` does.
+        footage: for a policy that sees pictures: `Footage` of the target, from whose pictures it learns.
 
     Returns:
         the new `Policy` and the metrics of each update.
     """
+    method, config = METHODS[policy.method].module, config or finetuning(policy)
     bank = policy.task.episodes(config.episodes, "train", seed).to(next(policy.network.parameters()).device)
-    run = apg.begin(dynamics, policy.task, [bank], config, seed, policy.network)
-    updates = apg.train(run, dynamics, policy.task, [bank], config)
+    filmed = {} if footage is None else {"footage": footage}
+    run = method.begin(dynamics, policy.task, [bank], config, seed, policy.network, **filmed)
+    updates = method.train(run, dynamics, policy.task, [bank], config)
     history = list(progress(updates) if progress else updates)
     if run.skipped == config.updates:
         raise InputError("fine-tuning: no update had a finite gradient; the residual may be of the wrong scale")
     info = {**policy.info, "finetuned_updates": run.update, "finetune_seed": seed}
-    return Policy(run.network, policy.task, info), history
+    return Policy(run.network, policy.task, info, policy.method), history
 
 
 def learn(policy, target, samples, kind="acceleration", exploration=0.1, seed=0):
     """Fly a policy in a target and fit a residual to its source: (transitions, residual, report), as `adapt` does."""
     device = next(policy.network.parameters()).device
-    transitions = _flown(as_actor(policy.network), target, policy.task, samples, exploration, seed, device)
+    transitions, _ = _flown(policy, target, policy.task, samples, exploration, seed, device)
     return transitions, *residuals.fit_residual(transitions, Dynamics(policy.task.system), kind, seed)
 
 
@@ -77,9 +85,10 @@ def adapt(
     kind="acceleration",
     exploration=0.1,
     seed=0,
-    config=FINETUNE,
+    config=None,
     oracle=False,
     context=None,
+    seen=None,
     progress=None,
     stage=lambda name: None,
     keep=lambda name, result: None,
@@ -87,16 +96,17 @@ def adapt(
     """Adapt a policy to a target from few transitions.
 
     Args:
-        policy: a `Policy`; its task's system is the source.
+        policy: a `Policy` that analytic policy gradients made; its task's system is the source.
         target: dynamics to fly and to evaluate in. None where the target is known by its transitions only: then
             policies are evaluated in the model with the residual, which stands in for it.
         samples: transitions to fly in the target; ignored where `transitions` are given.
         transitions: recorded `Transitions` to learn from instead.
         kind: of the residual, "acceleration" or "state".
         exploration: standard deviation of noise on the actions flown for data.
-        config: `APGConfig` of the fine-tuning.
+        config: of the fine-tuning, see `finetune`.
         oracle: also fine-tune for as long in the true target, as a bound of what data could give.
         context: values of the residual's context while the policy is tuned and evaluated (default: the recorded mean).
+        seen: the task as it is seen in the target (default: as the policy knows it); its camera may be another.
         progress: wraps iterables of updates, as `tqdm` does.
         stage: called with the name of each stage as it begins.
         keep: called with "transitions", "residual" and "policy" and the result, as soon as each exists.
@@ -104,29 +114,32 @@ def adapt(
     Raises:
         InputError: when there is neither target nor transitions, or the transitions don't fit the policy's robot.
     """
+    if METHODS[policy.method].pixels and (target is None or transitions is not None):
+        raise InputError("adapt: a policy that sees pictures learns from them, and has to fly in the target to get any")
     if target is None and transitions is None:
         raise InputError("adapt: needs a target to fly in, or recorded transitions")
     if target is None and oracle:
         raise InputError("--oracle: needs a target that can be flown in; a log has none")
     clock = Clock(stage)
     task, source = policy.task, Dynamics(policy.task.system)
+    seen = seen or task
     device = next(policy.network.parameters()).device
     tests = test_episodes(task).to(device)
-    actor = as_actor(policy.network)
+    actor, footage = policy.actor(seed), None
     clock.next("evaluate")
     evaluations = {"source": evaluate(actor, source, task, tests)}
     clock.next("collect")
     held_out = None
     if target is not None:
         if transitions is None:
-            transitions = _flown(actor, target, task, samples, exploration, seed, device)
+            transitions, footage = _flown(policy, target, seen, samples, exploration, seed, device)
         unseen = task.episodes(20, "validation", seed).to(device)
-        held_out = collect(actor, TrackingEnv(target, task, unseen, device=device), HELD_OUT)
+        held_out = collect(actor, tracking_env(target, seen, unseen, device=device), HELD_OUT)
     if transitions.context is not None:
         context = transitions.context.mean(0) if context is None else torch.as_tensor(context)
         if held_out is not None:
-            seen = context.expand(len(held_out), -1)
-            held_out = replace(held_out, context=seen, context_names=transitions.context_names)
+            constant = context.expand(len(held_out), -1)
+            held_out = replace(held_out, context=constant, context_names=transitions.context_names)
     keep("transitions", transitions)
     clock.next("fit")
     residual, fit = residuals.fit_residual(transitions, source, kind, seed)
@@ -138,25 +151,30 @@ def adapt(
     # A copy: what is returned stays on the CPU, where the transitions are.
     learned = copy.deepcopy(residual if context is None else residual.with_context(context)).to(device)
     clock.next("finetune")
-    tuned, history = finetune(policy, learned, config, seed, progress)
+    tuned, history = finetune(policy, learned, config, seed, progress, footage)
     keep("policy", tuned)
     clock.next("evaluate")
     truth = target if target is not None else learned
-    evaluations["zero_shot"] = evaluate(actor, truth, task, tests)
-    evaluations["few_shot"] = evaluate(as_actor(tuned.network), truth, task, tests)
+    evaluations["zero_shot"] = evaluate(actor, truth, seen, tests)
+    evaluations["few_shot"] = evaluate(tuned.actor(seed), truth, seen, tests)
     best = None
     if oracle:
         clock.next("oracle")
-        best, _ = finetune(policy, target, config, seed, progress)
-        evaluations["oracle"] = evaluate(as_actor(best.network), target, task, tests)
+        best, _ = finetune(policy, target, config, seed, progress, footage)
+        evaluations["oracle"] = evaluate(best.actor(seed), target, seen, tests)
     return Adaptation(tuned, residual, transitions, fit, evaluations, prediction, history, clock.stop(), best)
 
 
-def _flown(actor, target, task, samples, exploration, seed, device):
-    """Transitions of training episodes that the pretraining did not see."""
+def _flown(policy, target, task, samples, exploration, seed, device):
+    """Transitions of training episodes that the pretraining did not see, and the footage if it sees pictures."""
     episodes = task.episodes(max(20, 2 * samples // task.steps), "train", 1_000_000 + seed).to(device)
-    generator = torch.Generator().manual_seed(seed)
-    return collect(actor, TrackingEnv(target, task, episodes, device=device), samples, exploration, generator)
+    generator, actor = torch.Generator().manual_seed(seed), policy.actor(seed)
+    if task.camera is None:
+        return collect(
+            actor, tracking_env(target, task, episodes, device=device), samples, exploration, generator
+        ), None
+    footage = filmed(actor, target, task, episodes, samples, exploration, generator)
+    return film_transitions(footage, task.system), footage
 
 
 class Clock:

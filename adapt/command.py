@@ -10,6 +10,7 @@ import re
 import signal
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 from envs.errors import InputError
@@ -132,6 +133,23 @@ def pick_robot(name, vehicle):
     if own.system.name != system.name:
         raise InputError(f"--vehicle {vehicle}: is a {own.system.name}, --system says {system.name}")
     return own.system, own
+
+
+def filmed(task, settings=()):
+    """The task, seen through a camera with settings such as "height=64".
+
+    Raises:
+        InputError: a robot that can't be drawn, or a setting that makes no sense.
+    """
+    from envs.camera import SETTINGS, Camera
+
+    if not task.system.drawn:
+        raise InputError(f"--system {task.system.name}: can't be drawn, so no policy can see it; choose cartpole")
+    changes = [tuple(item.partition("=")[::2]) for item in settings]
+    for name, value in changes:
+        if name not in SETTINGS or not value:
+            raise InputError(f"--camera {name}: expected NAME=VALUE with one of {', '.join(SETTINGS)}")
+    return replace(task, camera=Camera().changed(changes))
 
 
 def pick_policy(path, system, vehicle, method="apg"):

@@ -1,6 +1,6 @@
 """Obtain a controller by the name of its method: load a trained one, or make a planner and the model it plans in."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from adapt import command
 from envs.errors import InputError
@@ -72,7 +72,7 @@ def obtain(options, system, vehicle, target, device="cpu"):
     if method.trained:
         policy = command.pick_policy(options.policy, system, vehicle, options.method)
         policy.network.to(device)
-        task = make_task(system, options.set, horizon=policy.task.horizon) if options.set else policy.task
+        task = replace(policy.task, set=options.set) if options.set else policy.task
         return Controller(policy.actor(options.seed), task, policy.info)
     task = make_task(system, options.set, **({"horizon": options.horizon} if options.horizon is not None else {}))
     model, info = _model(method.model, options, system, vehicle, target)

@@ -7,6 +7,7 @@ import tyro
 
 from adapt import command, controllers
 from envs.errors import InputError
+from policies import pick_method
 
 
 @dataclass(frozen=True)
@@ -16,8 +17,8 @@ class Options:
     system: str = "quadrotor"
     """Robot: cartpole, quadrotor or fixed_wing."""
     method: str = "apg"
-    """apg, ppo or pets (trained), or a planner: mpc in the nominal model, mpc-residual in that completed by a residual
-    learned in the target, mpc-target in the true target."""
+    """apg, ppo or pets (trained; from pictures: apg-pixels, ppo-pixels), or a planner: mpc in the nominal model,
+    mpc-residual in that completed by a residual learned in the target, mpc-target in the true target."""
     policy: str | None = None
     """Checkpoint of a trained method (default: the one that ships for the robot)."""
     target: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
@@ -54,6 +55,7 @@ class Options:
 
 def main(options):
     """Evaluate, print, and write JSON if asked for."""
+    from envs.domains import parse_target
     from envs.registry import make_dynamics
     from policies.evaluate import action_time, evaluate, test_episodes
 
@@ -61,9 +63,10 @@ def main(options):
     command.set_threads(options.threads)
     device = command.pick_device(options.device)
     system, vehicle = command.pick_robot(options.system, options.vehicle)
-    dynamics = make_dynamics(system, options.target)
+    domain = parse_target(options.target, system)
+    dynamics = make_dynamics(system, domain)
     controller = controllers.obtain(options, system, vehicle, dynamics, device)
-    task, actor = controller.task, controller.actor
+    task, actor = domain.seen(controller.task), controller.actor
     episodes = test_episodes(task, options.episodes, options.split, options.seed).to(device)
     result = evaluate(actor, dynamics, task, episodes, _progress(options))
     counts = {name: getattr(actor, name) for name in ("calls", "failures") if hasattr(actor, name)}
@@ -96,7 +99,7 @@ def check(options):
 
 def _progress(options):
     """A bar over the steps of a flight for methods that plan online, which take minutes."""
-    if options.method in ("apg", "ppo"):
+    if not pick_method(options.method).plans:
         return None
     from functools import partial
 

@@ -35,6 +35,8 @@ class Options:
     """What is different in the target, such as drag=0.3 or mass=x1.2; may be repeated (default: drag=0.3)."""
     policy: str | None = None
     """Checkpoint to start from (default: the one that ships for the robot)."""
+    pixels: bool = False
+    """Adapt a policy that sees pictures. The residual learns from states all the same, as of motion capture."""
     set: str | None = None
     """Family of episodes (quadrotor: paper, fast, circle, lemniscate, line, hover, or a CSV of waypoints)."""
     residual: str = "acceleration"
@@ -104,6 +106,8 @@ def _check(options):
     learned = {Path(path).resolve() for path in options.log}
     if both := [path for path in options.validate if Path(path).resolve() in learned]:
         raise InputError(f"--validate {both[0]}: is learned from with --log; give flights that are not")
+    if options.pixels and (options.log or options.transitions):
+        raise InputError("--pixels: learns from pictures, which logs and transitions don't hold; leave them out")
     if options.log and (options.target or options.oracle):
         raise InputError("--log: a recorded flight is the target; leave out --target and --oracle")
     from adapt.residual import MINIMUM
@@ -117,28 +121,32 @@ def _check(options):
 
 @dataclass(frozen=True)
 class Setting:
-    """The robot as modelled and, unless only logs tell of it, the target."""
+    """The robot as modelled and, unless only logs tell of it, the target: how it differs, and its dynamics."""
 
     system: object
     vehicle: object | None
-    target: object | None
+    domain: object | None = None
+    target: object | None = None
 
 
 def _setting(options):
+    from envs.domains import parse_target
     from envs.registry import make_dynamics
 
     system, vehicle = command.pick_robot(options.system, options.vehicle)
     if _recorded_only(options):
-        return Setting(system, vehicle, None)
-    return Setting(system, vehicle, make_dynamics(system, options.target or DEFAULT_TARGET))
+        return Setting(system, vehicle)
+    domain = parse_target(options.target or DEFAULT_TARGET, system)
+    return Setting(system, vehicle, domain, make_dynamics(system, domain))
 
 
 def _policy(options, setting):
-    from envs.registry import make_task
-
-    policy = command.pick_policy(options.policy, setting.system, setting.vehicle)
+    method = "apg-pixels" if options.pixels else "apg"
+    policy = command.pick_policy(options.policy, setting.system, setting.vehicle, method)
     if options.set is not None:
-        policy = replace(policy, task=make_task(setting.system, options.set, horizon=policy.task.horizon))
+        policy = replace(policy, task=replace(policy.task, set=options.set))
+    if setting.domain is not None:
+        setting.domain.seen(policy.task)  # a changed picture means nothing to a policy that sees the state
     policy.task.episodes(1, "train", 0)  # waypoints that can't be read or flown are told before anything is written
     return policy
 
@@ -174,7 +182,7 @@ def _flights(paths, options, setting):
 
 def _default_folder(options):
     robot = Path(options.vehicle).stem if options.vehicle else options.system
-    text = "-".join((robot, *_target_text(options).split()))
+    text = "-".join((robot, *(["pixels"] if options.pixels else []), *_target_text(options).split()))
     text = "".join(c if c.isalnum() or c in "-_.=," else "-" for c in text)
     return f"runs/fewshot-{text}-n{options.samples}-seed{options.seed}"
 
@@ -182,7 +190,7 @@ def _default_folder(options):
 def _adapt(options, setting, policy, recorded, folder, device):
     from tqdm import tqdm
 
-    from adapt.adaptation import FINETUNE, adapt
+    from adapt.adaptation import adapt, finetuning
     from policies.checkpoints import save_policy
 
     settings = {"options": asdict(options), **command.environment(options.seed, options.threads)}
@@ -194,9 +202,9 @@ def _adapt(options, setting, policy, recorded, folder, device):
         elif name == "residual":
             result.save(folder / "residual.safetensors")
         else:
-            save_policy(folder / "policy.safetensors", result.network, result.task, result.info)
+            save_policy(folder / "policy.safetensors", result.network, result.task, result.info, result.method)
 
-    updates = _updates(options)
+    updates = _updates(options, policy)
     policy.network.to(device)
     try:
         return adapt(
@@ -207,7 +215,8 @@ def _adapt(options, setting, policy, recorded, folder, device):
             kind=options.residual,
             exploration=options.exploration,
             seed=options.seed,
-            config=replace(FINETUNE, updates=updates),
+            config=replace(finetuning(policy), updates=updates),
+            seen=setting.domain and setting.domain.seen(policy.task),
             oracle=options.oracle,
             progress=lambda steps: tqdm(steps, total=updates, desc="fine-tuning", unit="update"),
             stage=lambda name: print(f"{name} ...", flush=True),
@@ -217,10 +226,10 @@ def _adapt(options, setting, policy, recorded, folder, device):
         raise KeyboardInterrupt(f"what was finished is in {folder}") from None
 
 
-def _updates(options):
-    from adapt.adaptation import FINETUNE
+def _updates(options, policy):
+    from adapt.adaptation import finetuning
 
-    return options.updates or (LOG_UPDATES if options.log else FINETUNE.updates)
+    return options.updates or (LOG_UPDATES if options.log else finetuning(policy).updates)
 
 
 def _metrics(options, policy, adaptation, validation):
@@ -232,7 +241,7 @@ def _metrics(options, policy, adaptation, validation):
         "metric": task.metric,
         "unit": task.unit,
         "samples": len(adaptation.transitions),
-        "updates": _updates(options),
+        "updates": _updates(options, policy),
         "seed": options.seed,
         **{name: evaluation.summary for name, evaluation in adaptation.evaluations.items()},
         "prediction": adaptation.prediction,

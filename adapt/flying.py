@@ -29,9 +29,9 @@ def collect(policy, env, n, exploration=0.0, generator=None):
     if not 0 <= exploration < math.inf:
         raise InputError(f"collect: exploration is {exploration:g}, expected at least 0")
     if isinstance(env, tuple):
-        from envs.env import TrackingEnv
+        from envs.pixels import tracking_env
 
-        env = TrackingEnv(*env)
+        env = tracking_env(*env)
     generator = generator or torch.Generator().manual_seed(0)
     flights, missing, queue = [], n, []
     while missing > 0:
@@ -57,7 +57,7 @@ def _fly(policy, env, episodes, steps, exploration, generator):
     from torchrl.envs.utils import step_mdp
 
     start = TensorDict({"episode": torch.tensor(episodes).unsqueeze(-1)}, batch_size=len(episodes), device=env.device)
-    now, record = env.reset(start), []
+    now, record = env.reset(start, set_state=True), []
     flying = torch.ones(len(episodes), dtype=torch.bool)
     for _ in range(steps):
         now = policy(now)
@@ -73,6 +73,32 @@ def _fly(policy, env, episodes, steps, exploration, generator):
         now = step_mdp(now)
     *parts, valid = (torch.stack(series, 1) for series in zip(*record, strict=True))
     return [tuple(part[i][valid[i]] for part in parts) for i in range(len(episodes))]
+
+
+def filmed(policy, target, task, episodes, n, exploration=0.0, generator=None, flights=10):
+    """Fly a policy that sees pictures in a target: `Footage` of `n` steps.
+
+    Args:
+        task: as it is seen in the target; it has a camera.
+        flights: how many robots fly side by side; one that falls begins again, so few long flights give way to many.
+    """
+    from envs.pixels import tracking_env
+    from policies.footage import STRAY, Footage, film
+
+    generator = generator or torch.Generator().manual_seed(0)
+    seed = int(torch.randint(2**31, (), generator=generator))
+    size = min(flights, n)
+    env = tracking_env(target, task, episodes, (size,), episodes.device, seed, threshold=STRAY * task.thresholds[1])
+    footage = Footage.empty(task, episodes.device)
+    film(footage, env, policy, env.reset(), -(-n // size), exploration, generator)
+    return footage.first(n)
+
+
+def film_transitions(footage, system):
+    """The transitions of footage, one flight after another."""
+    order = footage.flight.argsort(stable=True).cpu()
+    parts = [part.cpu()[order] for part in (footage.state, footage.action, footage.next_state, footage.flight)]
+    return Transitions(*parts, system.dt, system.name, system.State._fields, system.Action._fields)
 
 
 def _joined(flights, system):

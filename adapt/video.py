@@ -63,14 +63,23 @@ def write_video(adaptation, path, fps=30.0):
     Raises:
         InputError: `path` doesn't end in .mp4 or can't be written, or `fps` isn't positive.
     """
+    if not 0 < fps < float("inf"):
+        raise InputError(f"--video {path}: {fps:g} frames per second, expected more than 0")
+    write_frames(path, lambda: frames(adaptation, fps), fps)
+
+
+def write_frames(path, film, fps):
+    """Write the pictures (height, width, 3), blue, green, red, that `film()` yields as an MP4.
+
+    Raises:
+        InputError: `path` doesn't end in .mp4 or can't be written.
+    """
     path = Path(path)
     if path.suffix != ".mp4":
         raise InputError(f"--video {path}: expected a name that ends in .mp4")
-    if not 0 < fps < float("inf"):
-        raise InputError(f"--video {path}: {fps:g} frames per second, expected more than 0")
     if not path.parent.is_dir():
         raise InputError(f"--video {path}: there is no folder {path.parent}")
-    film = frames(adaptation, fps)
+    film = film()
     first = next(film)
     with whole(path) as partial:
         writer = cv2.VideoWriter(str(partial), cv2.VideoWriter_fourcc(*"mp4v"), fps, first.shape[1::-1])
@@ -161,7 +170,7 @@ def _extent(points):
 
 def _camera(system, flights, reference, size):
     """The view that holds everything, its panel's size, and whether flights stand one on another."""
-    azimuth, elevation = np.radians(system.camera)
+    azimuth, elevation = np.radians(system.filmed_from)
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     up = np.array([-np.cos(azimuth) * np.sin(elevation), -np.sin(azimuth) * np.sin(elevation), np.cos(elevation)])
     points = _seen(system, flights, reference, size)

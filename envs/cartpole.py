@@ -11,6 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import torch
 
+from envs.camera import Camera
 from envs.references import split_generator
 from envs.system import Axis, System, Task
 
@@ -60,7 +61,8 @@ class CartPole(System):
         "theta": Axis("pole angle", "deg", 180 / math.pi),
         "omega": Axis("pole rate", "rad/s"),
     }
-    camera: ClassVar[tuple[float, float]] = (-90.0, 0.0)
+    filmed_from: ClassVar[tuple[float, float]] = (-90.0, 0.0)
+    drawn: ClassVar[bool] = True
 
     dt: float = 0.05  # [s] control period
     cart_mass: float = 1.0  # [kg] Barto et al.
@@ -106,6 +108,10 @@ class CartPole(System):
     def residual_inputs(self, x, u):
         return x.v, x.theta.sin(), x.theta.cos() - 1, x.omega, u.force
 
+    def mirrored(self, state):
+        """The states (..., 4) of the robot seen in a mirror across the rail."""
+        return -state
+
     def place(self, x):
         """The tip of the pole."""
         length = 2 * self.pole_half_length
@@ -145,6 +151,7 @@ class Balance(Task):
     system: CartPole = CartPole()
     set: str = "balance"
     steps: int = 250
+    camera: Camera | None = None  # through which a policy sees the robot in place of its state
 
     def episodes(self, n, split, seed, speed=1.0):
         uniform = 2 * torch.rand(n, 4, generator=split_generator(split, seed)) - 1

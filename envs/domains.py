@@ -1,12 +1,14 @@
 """Source and target domains: how the robot differs from its model.
 
 A `Domain` changes parameters (a payload, a longer pole) and adds disturbances (drag, wind, a push). The empty domain is
-the source. On the command line a domain is written `drag=0.3`, `mass=x1.2`, `push=0.5,0,0.2`; several combine.
+the source. On the command line a domain is written `drag=0.3`, `mass=x1.2`, `push=0.5,0,0.2`; several combine. Where a
+camera watches the robot, its picture may differ too: `brightness=0.7`, `cart_colour=200,40,40`, `offset_x=0.1`.
 """
 
 from dataclasses import dataclass, fields, replace
 from functools import partial
 
+from envs.camera import CHANGEABLE, Camera
 from envs.errors import InputError
 
 WIND_DRAG = 0.3  # [1/s] rotor drag through which a disturbance `wind` is felt
@@ -40,10 +42,15 @@ SCALAR = ("drag", "quadratic_drag")  # disturbances whose strength has no direct
 
 @dataclass(frozen=True)
 class Domain:
-    """Parameter changes, as (field, value) pairs, and disturbances, as (name, strength) with a strength in x, y, z."""
+    """How a target differs: parameters, disturbances, and what a camera sees.
+
+    Parameter changes are (field, value) pairs, disturbances (name, strength) with a strength in x, y, z, and changes of
+    the picture (field, text), see `Camera.changed`.
+    """
 
     changes: tuple[tuple[str, float], ...] = ()
     disturbances: tuple[tuple[str, tuple[float, float, float]], ...] = ()
+    picture: tuple[tuple[str, str], ...] = ()
 
     def apply(self, system):
         """The changed system; its low-level controller keeps the beliefs of the source."""
@@ -53,6 +60,21 @@ class Domain:
         """The disturbances as functions (system, x, u) -> {state name: extra rate}."""
         return tuple(partial(DISTURBANCES[name], strength=strength) for name, strength in self.disturbances)
 
+    def seen(self, task):
+        """The task, through the changed camera.
+
+        Raises:
+            InputError: the picture differs, but the task is one whose policies see the state.
+        """
+        if not self.picture:
+            return task
+        if task.camera is None:
+            name, value = self.picture[0]
+            raise InputError(
+                f"--target {name}={value}: changes the picture, but this policy sees the state; leave it out"
+            )
+        return replace(task, camera=task.camera.changed(self.picture))
+
 
 def parse_target(text, system):
     """Read `drag=0.3` or several, separated by spaces or given as a sequence, for a system.
@@ -61,7 +83,7 @@ def parse_target(text, system):
         InputError: on an unknown name, a value that isn't a number, or one that makes no physical sense.
     """
     items = text.split() if isinstance(text, str) else [item for part in text for item in part.split()]
-    changes, disturbances = {}, []
+    changes, disturbances, picture = {}, [], []
     for item in items:
         name, sign, value = item.partition("=")
         if not sign or not name or not value:
@@ -70,12 +92,15 @@ def parse_target(text, system):
             changes.update(_changes(item, name, value, system, changes))
         elif name in DISTURBANCES:
             disturbances.append((name, _strength(item, name, value)))
+        elif system.drawn and name in CHANGEABLE:
+            picture.append((name, value))
         else:
-            known = ", ".join([*DISTURBANCES, *_parameters(system)])
+            known = ", ".join([*DISTURBANCES, *_parameters(system), *(CHANGEABLE if system.drawn else ())])
             raise InputError(f"--target {item}: {system.name} has no {name!r}; expected one of {known}")
-    domain = Domain(tuple(changes.items()), tuple(disturbances))
+    domain = Domain(tuple(changes.items()), tuple(disturbances), tuple(picture))
     try:
         domain.apply(system)  # all changes at once: one alone may make no sense yet
+        Camera().changed(domain.picture)
     except InputError as error:
         raise InputError(f"--target {' '.join(items)}: {error}") from None
     return domain

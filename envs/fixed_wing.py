@@ -92,7 +92,7 @@ class FixedWing(System):
         "w_b": Axis("velocity down", "m/s"),
         **{rate: Axis(f"{name} rate", "rad/s") for rate, name in zip("pqr", ("roll", "pitch", "yaw"), strict=True)},
     }
-    camera: ClassVar[tuple[float, float]] = (-70.0, 18.0)
+    filmed_from: ClassVar[tuple[float, float]] = (-70.0, 18.0)
 
     dt: float = 0.05  # [s] control period
     mass: float = 1.01  # [kg] this and what follows: reference implementation of Wiedemann, Wuest et al. (2023)

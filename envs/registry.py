@@ -43,7 +43,7 @@ def make_task(system, set=None, **options):
 
 
 def make_env(system, target="", task=None, batch_size=(), device="cpu", seed=0, split="train", episodes=1000):
-    """A TorchRL environment of a system in a target domain.
+    """A TorchRL environment of a system in a target domain, with `pixels` where the task has a camera.
 
     Args:
         system: name or instance.
@@ -51,10 +51,12 @@ def make_env(system, target="", task=None, batch_size=(), device="cpu", seed=0, 
         task: a `Task`, the name of a set of episodes, or None for the default.
         split: the split that the `episodes` are drawn from; with `seed` it fixes them.
     """
-    from envs.env import TrackingEnv
+    from envs.pixels import tracking_env
 
     system = make_system(system)
     if task is None or isinstance(task, str):
         task = make_task(system, task)
-    dynamics = make_dynamics(system, target)
-    return TrackingEnv(dynamics, task, task.episodes(episodes, split, seed), batch_size, device, seed)
+    domain = target if isinstance(target, Domain) else parse_target(target, system)
+    task = domain.seen(task)
+    dynamics = make_dynamics(system, domain)
+    return tracking_env(dynamics, task, task.episodes(episodes, split, seed), batch_size, device, seed)

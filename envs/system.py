@@ -39,7 +39,8 @@ class System(ABC):
     bounds: ClassVar[dict[str, tuple[float, float]]] = {}  # open interval of each checked parameter
     groups: ClassVar[dict[str, tuple[str, ...]]] = {}  # one name for several fields that are scaled together
     axes: ClassVar[dict[str, Axis]] = {}  # how states are shown; those without one go by their name
-    camera: ClassVar[tuple[float, float]] = (-60.0, 25.0)  # [deg] azimuth and elevation it is filmed from
+    filmed_from: ClassVar[tuple[float, float]] = (-60.0, 25.0)  # [deg] azimuth and elevation it is filmed from
+    drawn: ClassVar[bool] = False  # whether `envs.drawing` draws it, so that a policy can see it through a `Camera`
 
     dt: float  # [s] control period
 
@@ -135,6 +136,7 @@ class Task(ABC):
     views: ClassVar[tuple[tuple[str, str], ...]] = ()  # pictures of a flight: pairs of states, or "t" and a state
     trace_name: ClassVar[str] = "distance to reference"  # what `trace` is
     trace_unit: ClassVar[str] = "m"
+    camera: ClassVar[object] = None  # a field of tasks whose robot can be drawn: through which a policy sees it
 
     system: System
     set: str

@@ -17,6 +17,8 @@ class Method:
 
     home: str
     model: str | None = None
+    pixels: bool = False  # whether its policies see pictures in place of the state
+    plans: bool = False  # whether an action takes planning, so that a flight takes minutes
 
     @property
     def trained(self):
@@ -31,11 +33,13 @@ class Method:
 
 METHODS = {
     "apg": Method("policies.apg"),
+    "apg-pixels": Method("policies.apg_pixels", pixels=True),
     "ppo": Method("policies.ppo"),
-    "pets": Method("policies.pets"),
-    "mpc": Method("policies.mpc", model="source"),
-    "mpc-residual": Method("policies.mpc", model="residual"),
-    "mpc-target": Method("policies.mpc", model="target"),
+    "ppo-pixels": Method("policies.ppo_pixels", pixels=True),
+    "pets": Method("policies.pets", plans=True),
+    "mpc": Method("policies.mpc", model="source", plans=True),
+    "mpc-residual": Method("policies.mpc", model="residual", plans=True),
+    "mpc-target": Method("policies.mpc", model="target", plans=True),
 }
 
 

@@ -12,7 +12,7 @@ PPO reads of a network only what every such network offers:
 | `unit`              | buffer of one element: the mean cost of a step, 0 until the training has set it                |
 | `normalise`         | TensorDict (N,) of what random actions showed → sets the normalisation                         |
 
-`ActorCritic` is the one for states and references.
+`ActorCritic` is the one for states and references, `PixelActorCritic` of `policies.pixel_actor_critic` for pictures.
 """
 
 from dataclasses import dataclass
@@ -64,19 +64,24 @@ class StochasticPolicy(nn.Module):
     """Location and scale (..., m) of the normal distribution whose tanh is the action.
 
     The scale is learned and the same in all states.
+
+    Args:
+        trunk: module from what the policy reads to features (..., width).
+        width: how many features there are.
+        actions: m.
     """
 
-    def __init__(self, config):
+    def __init__(self, trunk, width, actions):
         super().__init__()
-        self.trunk = Trunk(config, config.observations)
-        self.head = nn.Linear(config.widths[-1], config.actions)
-        self.log_scale = nn.Parameter(torch.zeros(config.actions))
+        self.trunk = trunk
+        self.head = nn.Linear(width, actions)
+        self.log_scale = nn.Parameter(torch.zeros(actions))
         with torch.no_grad():  # the first actions are spread about the middle of their range in every state
             self.head.weight.mul_(0.01)
             self.head.bias.zero_()
 
-    def forward(self, observation, window):
-        location = self.head(self.trunk(observation, window))
+    def forward(self, *seen):
+        location = self.head(self.trunk(*seen))
         location = LOCATION_LIMIT * torch.tanh(location / LOCATION_LIMIT)
         return location, self.log_scale.exp().expand_as(location)
 
@@ -112,7 +117,8 @@ class ActorCritic(nn.Module):
     def __init__(self, config: ActorCriticConfig):
         super().__init__()
         self.config = config
-        self.policy, self.critic = StochasticPolicy(config), Critic(config)
+        self.policy = StochasticPolicy(Trunk(config, config.observations), config.widths[-1], config.actions)
+        self.critic = Critic(config)
         self.register_buffer("unit", torch.zeros(()))
 
     @staticmethod

@@ -13,6 +13,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
+from envs.camera import Camera
 from envs.errors import InputError
 from envs.registry import make_system, make_task
 from policies import METHODS
@@ -37,12 +38,13 @@ class Policy:
 
 def save_policy(path, network, task, info, method="apg"):
     """Write a checkpoint; `info` is any JSON about how it came about (command, seed, validation error)."""
+    said = {"set": task.set, "steps": task.steps, "horizon": task.horizon}
     metadata = {
         "format": FORMAT,
         "method": method,
         "network": json.dumps(asdict(network.config)),
         "system": json.dumps({"name": task.system.name, **asdict(task.system)}),
-        "task": json.dumps({"set": task.set, "steps": task.steps, "horizon": task.horizon}),
+        "task": json.dumps({**said, **({"camera": asdict(task.camera)} if task.camera else {})}),
         "info": json.dumps(info),
     }
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
@@ -96,7 +98,7 @@ def load_policy(source, system=None, method="apg"):
         network_class = METHODS[found].module.Network
         trained_for = _system(json.loads(metadata["system"]))
         config = network_class.Config(**_hashable(json.loads(metadata["network"])))
-        task = make_task(trained_for, **json.loads(metadata["task"]))
+        task = _task(trained_for, json.loads(metadata["task"]))
         network = network_class(config)
         network.load_state_dict(tensors)
         info = json.loads(metadata["info"])
@@ -115,6 +117,12 @@ def load_policy(source, system=None, method="apg"):
 def _system(values):
     values = _hashable(values)
     return replace(make_system(values.pop("name")), **values)
+
+
+def _task(system, values):
+    if "camera" in values:
+        values["camera"] = Camera(**_hashable(values["camera"]))
+    return make_task(system, **values)
 
 
 def _hashable(values):

@@ -9,7 +9,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
-from envs.env import TrackingEnv
+from envs.drawing import draw
+from envs.pixels import tracking_env
 
 WARM_UP = 20  # calls that are not timed: the first ones set things up
 TEST_EPISODES = {"cartpole": 50, "quadrotor": 50, "fixed_wing": 30}  # as many as the published tables use
@@ -51,9 +52,9 @@ def evaluate(actor, dynamics, task, episodes, progress=None):
     Args:
         progress: wraps the iterable of steps, as `tqdm` does.
     """
-    env = TrackingEnv(dynamics, task, episodes, batch_size=(len(episodes),), device=episodes.device)
+    env = tracking_env(dynamics, task, episodes, batch_size=(len(episodes),), device=episodes.device)
     rows = torch.arange(len(episodes), device=episodes.device).unsqueeze(-1)
-    now = env.reset(TensorDict({"episode": rows}, batch_size=env.batch_size))
+    now = env.reset(TensorDict({"episode": rows}, batch_size=env.batch_size), set_state=True)
     states, actions, done = [now["state"]], [], torch.zeros_like(now["done"])
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in progress(range(task.steps)) if progress else range(task.steps):
@@ -111,6 +112,7 @@ class FlightForTiming:
     def _begin(self, episode):
         self.episode, self.step = torch.tensor([episode % len(self.episodes)]), torch.zeros(1, dtype=torch.long)
         self.state = self.task.start(self.episodes[self.episode], self.step)
+        self.pictures = None
 
     def seen(self):
         """What a policy reads, computed now."""
@@ -118,7 +120,17 @@ class FlightForTiming:
         reference = task.reference(self.episodes[self.episode], self.step, state)
         seen = {"observation": task.observe(state), "window": task.window(state, reference), "reference": reference}
         place = {"state": state, "episode": self.episode.unsqueeze(-1), "step": self.step.unsqueeze(-1)}
+        if task.camera is not None:
+            seen["pixels"] = self._stacked()
         return TensorDict({**seen, **place}, batch_size=(1,))
+
+    def _stacked(self):
+        """The last pictures; the present one is drawn now."""
+        camera = self.task.camera
+        picture = draw(camera, self.dynamics.system, self.state)
+        older = self.pictures[:, :-3] if self.pictures is not None else picture.repeat(1, camera.frames - 1, 1, 1)
+        self.pictures = torch.cat((picture, older), 1)
+        return self.pictures
 
     def advance(self, action):
         """One control period; the next episode where this one has ended."""

@@ -121,8 +121,8 @@ class FirstAction(nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(self, observation, window):
-        return self.network(observation, window)[..., 0, :]
+    def forward(self, *inputs):
+        return self.network(*inputs)[..., 0, :]
 
 
 def as_actor(network):

@@ -14,9 +14,10 @@ from tensordict import TensorDict
 
 from envs.dynamics import Dynamics
 from envs.errors import InputError
+from envs.pixels import reseed
 from policies.actor_critic import ActorCritic, actor_critic_for, as_mean_actor
 from policies.apg import stage
-from policies.ppo_update import PLACE, environment, fly, improve, joined, judge
+from policies.ppo_update import environment, fly, improve, joined, judge, place_keys, study
 
 Network = ActorCritic
 
@@ -36,6 +37,7 @@ class Config:
     least_updates: int = 10  # fewer episodes are flown side by side where the samples would last for less
     epochs: int = 4  # passes over the data of an update, fewer where the policy has moved too far
     minibatches: int = 4
+    critic_epochs: int = 0  # passes before those, in which only the critic learns
     width: int | None = None  # neurons of every layer of both networks; None: those of the paper
     learning_rate: float = 1e-3
     target_kl: float = 0.02  # divergence of the policies before and after an update
@@ -57,6 +59,8 @@ class Config:
         for name in ("learning_rate", "target_kl", "clip", "final_exploration", "exploration", "norm"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"{_called(name)} {getattr(self, name)}: expected more than 0")
+        if not self.critic_epochs >= 0:
+            raise InputError(f"ppo.Config.critic_epochs {self.critic_epochs}: expected at least 0")
         for name in ("final_rate", "discount", "trace", "curriculum"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"{_called(name)} {getattr(self, name)}: expected between 0 and 1")
@@ -124,7 +128,7 @@ class Training:
     network: torch.nn.Module
     optimizer: torch.optim.Optimizer
     generator: torch.Generator
-    place: TensorDict  # state, episode and step of each robot
+    place: TensorDict  # where each robot is, see `place_keys`
     rate: float  # learning rate of the policy
     update: int = 0
     samples: int = 0
@@ -137,7 +141,7 @@ class Training:
             "network": self.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
-            "place": {name: self.place[name] for name in PLACE},
+            "place": dict(self.place.items()),
             **numbers,
         }
 
@@ -146,29 +150,30 @@ class Training:
         self.network.load_state_dict(saved["network"])
         self.optimizer.load_state_dict(saved["optimizer"])
         self.generator.set_state(saved["generator"])
-        place = {name: saved["place"][name].to(self.place.device) for name in PLACE}
+        place = {name: saved["place"][name].to(self.place.device) for name in place_keys(task)}
         self.place = TensorDict(place, batch_size=self.place.batch_size, device=self.place.device)
         for name in ("rate", "update", "samples", "skipped"):
             setattr(self, name, saved[name])
 
 
-def begin(dynamics, task, banks, config, seed, network=None):
+def begin(dynamics, task, banks, config, seed, network=None, fresh=actor_critic_for):
     """A training run before its first update.
 
     Args:
         network: go on with a copy of it; None: draw one from the seed and normalise it from random actions.
+        fresh: (task, width) → what is drawn.
     """
     generator = torch.Generator().manual_seed(seed)
     with drawing_from(generator) as drawn:
         if network is None:
-            network = actor_critic_for(task, config.width).to(banks[0].device)
+            network = fresh(task, config.width).to(banks[0].device)
             network.normalise(_random_flights(task, banks[-1], drawn))
             network.policy.limit(config.exploration, config.exploration)
         else:
             network = copy.deepcopy(network).to(banks[0].device)
         env = environment(dynamics, task, banks[stage(config, task, len(banks), 0)[1]], config.side_by_side)
-        env.set_seed(drawn)
-        place = env.reset().select(*PLACE)
+        reseed(env, drawn)
+        place = env.reset().select(*place_keys(task))
     groups = [{"params": list(part.parameters())} for part in (network.policy, network.critic)]
     return Training(network, torch.optim.Adam(groups), generator, place, config.learning_rate)
 
@@ -182,13 +187,14 @@ def drawing_from(generator):
         yield seed
 
 
-def _random_flights(task, episodes, seed, size=256, steps=40):
+def _random_flights(task, episodes, seed, steps=40):
     """What the environment shows (N,) where random actions lead to around the reference.
 
     Flown in the nominal robot, whose model is known: no transition of the robot that is trained in is spent on it.
     """
+    size = 256 if task.camera is None else 8  # a picture holds as many numbers as 10 000 states
     env = environment(Dynamics(task.system), task, episodes, size)
-    env.set_seed(seed)
+    reseed(env, seed)
     return env.rollout(steps, break_when_any_done=False).reshape(-1)
 
 
@@ -202,18 +208,20 @@ def train(run, dynamics, task, banks, config):
     """
     with torch.random.fork_rng():  # TorchRL tries the policy out
         parts = joined(run.network, dynamics, task, banks[0], config)
-    parts.env.anywhere = config.anywhere
+    parts.tracking.anywhere = config.anywhere
     while run.update < config.updates:
         share = run.update / config.updates
         threshold, bank = stage(config, task, len(banks), run.update)
         _move(run, task, banks[bank], changed=bank != stage(config, task, len(banks), max(0, run.update - 1))[1])
-        parts.env.threshold, parts.env.episodes = threshold, banks[bank]
+        parts.tracking.threshold, parts.tracking.episodes = threshold, banks[bank]
         ceiling = config.exploration * (config.final_exploration / config.exploration) ** share
         run.network.policy.limit(config.final_exploration, ceiling)
         with drawing_from(run.generator) as seed:
             flown = fly(run, parts, seed)
             metrics = judge(flown, run.network, parts, config)
-            metrics |= improve(flown, run, parts, config, fall=1 - (1 - config.final_rate) * share)
+            fall = 1 - (1 - config.final_rate) * share
+            study(flown, run, parts, config, fall)
+            metrics |= improve(flown, run, parts, config, fall)
         run.update += 1
         run.samples += flown.numel()
         counts = {"update": run.update, "samples": run.samples, "threshold": threshold, "stage": bank}
@@ -225,3 +233,4 @@ def _move(run, task, episodes, changed):
     if changed:
         rows, step = episodes[run.place["episode"].squeeze(-1)], run.place["step"].squeeze(-1)
         run.place["state"] = task.start(rows, step)
+        run.place = run.place.exclude("pixels")  # of where they were

@@ -1,4 +1,4 @@
-"""One update of PPO: fly with the present policy, judge what was flown, improve policy and critic on it.
+"""One update of PPO: fly with the present policy, judge what was flown, improve critic and policy on it.
 
 The parts are TorchRL's: `Collector`, `GAE`, `ClipPPOLoss`, `ReplayBuffer`.
 """
@@ -10,31 +10,44 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacement
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, step_mdp
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from envs.env import TrackingEnv
+from envs.pixels import PLACE, reseed, tracking_env
 
-PLACE = ("state", "episode", "step")  # what the environment goes on from
+CRITIC_BATCH = 256  # transitions of a minibatch of the critic alone
 WORST = 100.0  # [-] cost of a step, in units of the mean, that counts at most and where it is not finite
 
 
 def environment(dynamics, task, episodes, size):
     """Episodes side by side that start anywhere on their reference, and again where they stray from it."""
-    return TrackingEnv(dynamics, task, episodes, (size,), episodes.device, anywhere=True, threshold=task.thresholds[1])
+    options = {"anywhere": True, "threshold": task.thresholds[1]}
+    return tracking_env(dynamics, task, episodes, (size,), episodes.device, **options)
+
+
+def place_keys(task):
+    """What the environment of a task goes on from. Older pictures of a stack can't be drawn from the state."""
+    return tuple(key for key in PLACE if key != "pixels" or task.camera is not None)
 
 
 @dataclass
 class Parts:
     """TorchRL's parts, joined to a network."""
 
-    env: TrackingEnv
+    env: EnvBase
     collector: Collector
     advantage: GAE
     loss: ClipPPOLoss
     memory: ReplayBuffer
+
+    @property
+    def tracking(self):
+        """The environment that has task, episodes and limits; a camera is a transform around it."""
+        return self.env if isinstance(self.env, TrackingEnv) else self.env.base_env
 
 
 def joined(network, dynamics, task, episodes, config):
@@ -67,10 +80,10 @@ def joined(network, dynamics, task, episodes, config):
 
 def fly(run, parts, seed):
     """The next transitions (B, T) of all robots. The collector is told where they are, so that a run can be resumed."""
-    parts.env.set_seed(seed)
+    reseed(parts.env, seed)
     parts.collector.reset(tensordict=run.place, set_state=True)
     flown = parts.collector.rollout()
-    run.place = parts.env.maybe_reset(step_mdp(flown[:, -1])).select(*PLACE).clone()
+    run.place = parts.env.maybe_reset(step_mdp(flown[:, -1])).select(*place_keys(parts.tracking.task)).clone()
     return flown
 
 
@@ -91,13 +104,18 @@ def judge(flown, network, parts, config):
     for key in network.critic_keys:
         here, there = flown[key], following[key]
         following[key] = torch.where(done.reshape(*done.shape[:2], *[1] * (here.ndim - 2)), here, there)
-    strayed = following["truncated"] & (following["step"] < parts.env.task.steps)
+    strayed = following["truncated"] & (following["step"] < parts.tracking.task.steps)
     following["terminated"] = torch.zeros_like(done)
+    _value(flown, parts)
+    return {"cost": float(mean), "reward": -float(mean), "resets": float(strayed.float().mean())}
+
+
+def _value(flown, parts):
+    """Write value targets, and advantages of mean 0 and deviation 1, into `flown`."""
     with torch.no_grad():
         parts.advantage(flown)
     advantage = flown["advantage"]
     flown["advantage"] = (advantage - advantage.mean()) / advantage.std(correction=0).clamp(min=1e-6)
-    return {"cost": float(mean), "reward": -float(mean), "resets": float(strayed.float().mean())}
 
 
 def _set_unit(unit, cost):
@@ -109,6 +127,28 @@ def _set_unit(unit, cost):
     mean = cost.clamp(max=WORST * (cost.median() if fresh else unit)).mean()
     unit.copy_((mean if fresh else 0.95 * unit + 0.05 * mean).clamp(min=1e-6))
     return mean
+
+
+def study(flown, run, parts, config, fall):
+    """Passes in which the critic alone learns from `flown`, which is judged anew after each.
+
+    A critic that reads the state costs little next to a policy that reads pictures, and the better it knows what
+    follows a state, the less of that is left in the advantages as noise.
+    """
+    network, critic = run.network, run.optimizer.param_groups[1]
+    critic["lr"] = config.learning_rate * fall
+    for _ in range(config.critic_epochs):
+        rows = flown.select(*network.critic_keys, "value_target").reshape(-1)
+        for some in torch.randperm(len(rows)).to(rows.device).split(CRITIC_BATCH):
+            part = rows[some]
+            value = network.critic(*(part[key] for key in network.critic_keys))
+            run.optimizer.zero_grad(set_to_none=True)
+            (value - part["value_target"]).square().mean().backward()
+            if torch.isfinite(torch.nn.utils.clip_grad_norm_(critic["params"], config.norm)):
+                run.optimizer.step()
+            else:
+                run.skipped += 1
+        _value(flown, parts)
 
 
 def improve(flown, run, parts, config, fall):

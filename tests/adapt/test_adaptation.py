@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from adapt.adaptation import FINETUNE, Clock, adapt, finetune
+from adapt.adaptation import Clock, adapt, finetune
 from adapt.flying import collect
 from adapt.residual import MINIMUM
 from adapt.transitions import Transitions
@@ -16,7 +16,7 @@ from envs.errors import InputError
 from policies import apg
 from policies.networks import as_actor
 
-QUICK = replace(FINETUNE, updates=30, batch=64, episodes=100)
+QUICK = replace(apg.FINETUNE, updates=30, batch=64, episodes=100)
 TARGET = "drag=1"
 
 
@@ -221,7 +221,7 @@ def test_progress_wraps_the_updates(rough_cartpole, target):
 
 def test_the_tuning_has_no_curriculum(rough_quadrotor):
     last = rough_quadrotor.task.thresholds[1]
-    assert [apg.stage(FINETUNE, rough_quadrotor.task, 1, update) for update in (1, 2, 199)] == [(last, 0)] * 3
+    assert [apg.stage(apg.FINETUNE, rough_quadrotor.task, 1, update) for update in (1, 2, 199)] == [(last, 0)] * 3
 
 
 def test_a_stage_that_comes_back_goes_on_counting():

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from adapt import pretrain, training_log
+from adapt import pretrain, training, training_log
 from envs import make_dynamics, make_system
 from policies import apg, evaluate
 from policies.checkpoints import load_policy
@@ -26,9 +26,9 @@ FILES = {"config.json", "log.csv", "policy.safetensors", "training.pt"}
 @pytest.fixture(autouse=True)
 def few_validations(monkeypatch):
     """Few short validations, and no TensorBoard files where it happens to be installed."""
-    whole = pretrain.validate
+    whole = training.validate
     monkeypatch.setattr(
-        pretrain, "validate", lambda actor, dynamics, task, n: whole(actor, dynamics, replace(task, steps=20), n=3)
+        training, "validate", lambda actor, dynamics, task, n: whole(actor, dynamics, replace(task, steps=20), n=3)
     )
     monkeypatch.setattr(training_log, "_tensorboard", lambda folder: None)
 
@@ -80,17 +80,17 @@ def test_it_leaves_a_policy_a_log_its_settings_and_what_resumes_it(call, tmp_pat
 def test_the_best_policy_by_validation_is_kept(tmp_path, call, monkeypatch):
     scores = iter([(0.0, float("nan")), (0.5, 2.0), (0.5, 3.0), (1.0, 9.0), (1.0, 8.0), (0.9, 0.1)])
     monkeypatch.setattr(
-        pretrain, "validate", lambda *_: dict(zip(("success", "mean"), next(scores), strict=True)) | {"std": 0, "n": 1}
+        training, "validate", lambda *_: dict(zip(("success", "mean"), next(scores), strict=True)) | {"std": 0, "n": 1}
     )
     kept = []
-    whole = pretrain._keep_best
+    whole = training._keep
 
     def noted(*args):
         before = args[-1]
         kept.append(whole(*args) != before)
         return whole(*args)
 
-    monkeypatch.setattr(pretrain, "_keep_best", noted)
+    monkeypatch.setattr(training, "_keep", noted)
     answer = call("pretrain", *TINY, "--every", 2, "--out", tmp_path)
     assert kept == [True, True, False, True, True, False]
     info = load_policy(tmp_path / "policy.safetensors").info
@@ -145,8 +145,8 @@ def test_what_was_logged_after_the_last_save_is_done_again(call, tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     call("pretrain", *TINY, "--out", whole)
     with pytest.MonkeyPatch.context() as patch:
-        save = pretrain._save_training
-        patch.setattr(pretrain, "_save_training", lambda run, *rest: die() if run.update > 4 else save(run, *rest))
+        save = training._save
+        patch.setattr(training, "_save", lambda run, *rest: die() if run.update > 4 else save(run, *rest))
         with pytest.raises(RuntimeError):
             call("pretrain", *TINY, "--out", killed)
     assert [row["update"] for row in rows(killed)] == ["4", "8"]
@@ -222,7 +222,7 @@ def test_a_state_that_holds_code_is_refused_and_the_code_does_not_run(refused, t
 
 
 def test_it_stops_early_where_asked(call, tmp_path, monkeypatch):
-    monkeypatch.setattr(pretrain, "validate", lambda *_: {"mean": 0.04, "success": 1.0})
+    monkeypatch.setattr(training, "validate", lambda *_: {"mean": 0.04, "success": 1.0})
     call("pretrain", *TINY, "--stop-at", 0.05, "--out", tmp_path)
     assert [row["update"] for row in rows(tmp_path)] == ["4"]
 
@@ -351,7 +351,7 @@ def test_a_compiler_that_is_missing_does_not_stop_it(monkeypatch, capsys):
 
     monkeypatch.setattr(torch, "compile", none)
     dynamics = make_dynamics("cartpole")
-    assert pretrain.compiled(dynamics) is dynamics
+    assert training.compiled(dynamics) is dynamics
     assert "not possible here (RuntimeError), going on without" in capsys.readouterr().out
 
 
@@ -360,7 +360,7 @@ def test_validation_is_not_the_test(rough_cartpole, monkeypatch):
     whole = evaluate.test_episodes
     monkeypatch.setattr(evaluate, "test_episodes", lambda task, n, split: asked.append(split) or whole(task, n, split))
     task = rough_cartpole.task
-    pretrain.validate(as_actor(network_for(task)), make_dynamics("cartpole"), task, 100)
+    training.validate(as_actor(network_for(task)), make_dynamics("cartpole"), task, 100)
     assert asked == ["validation"]
 
 

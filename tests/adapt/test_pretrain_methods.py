@@ -6,7 +6,7 @@ import json
 import pytest
 import torch
 
-from adapt import pretrain, training_log
+from adapt import training, training_log
 from adapt.residual_kinds import make_residual
 from envs import make_dynamics
 from policies.checkpoints import load_policy
@@ -24,10 +24,10 @@ def quick(monkeypatch):
 
     from policies import pets
 
-    whole = pretrain.validate
+    whole = training.validate
     short = {"steps": 10}
     monkeypatch.setattr(
-        pretrain, "validate", lambda actor, dynamics, task, n: whole(actor, dynamics, replace(task, **short), n=1)
+        training, "validate", lambda actor, dynamics, task, n: whole(actor, dynamics, replace(task, **short), n=1)
     )
     monkeypatch.setattr(training_log, "_tensorboard", lambda folder: None)
     small = replace(pets.PRESETS["cartpole"], rounds=2, fit=replace(pets.Config().fit, steps=20))
@@ -74,7 +74,7 @@ def test_the_same_seed_trains_the_same_and_another_seed_does_not(call, tmp_path,
 def test_training_goes_on_in_a_target_and_the_last_policy_is_kept(call, tmp_path, method, monkeypatch):
     start = trained(call, tmp_path / "source", method)
     worse = {"mean": 9.0, "std": 0.0, "success": 0.0, "n": 1}
-    monkeypatch.setattr(pretrain, "validate", lambda *_: worse)
+    monkeypatch.setattr(training, "validate", lambda *_: worse)
     path = tmp_path / "source" / "policy.safetensors"
     options = ("--policy", path, "--target", "push=1", "--samples", 40, "--out", tmp_path / "a")
     answer = call("pretrain", "--system", "cartpole", "--method", method, *options)
