@@ -10,7 +10,9 @@ from adapt import command, pretrain
 from envs.errors import InputError
 
 METHODS = {"apg": 1000, "ppo": 200_000, "mpc": 1000}  # steps of the robot that each may use unless told otherwise
-EPISODES = {"mpc": 10}  # test episodes where planning takes too long for all
+EPISODES = {"mpc": 20}  # test episodes where planning takes too long for all
+# Ways to plan on pictures that one would try first, and what comes of them: settings of `pixel_mpc.Config`.
+ATTEMPTS = {"mpc, distance to the goal alone": {"rest": 0.0}, "mpc, nearest recorded step": {"model": "nearest"}}
 RESULTS = ("metrics.json", "learning.png", "frames.png", "saliency.png", "balance.mp4", *pretrain.OUTPUTS)
 
 
@@ -25,7 +27,8 @@ class Options:
     samples: int | None = None
     """Steps of the robot that may be used (default: 1000; 200000 for ppo)."""
     method: str = "apg"
-    """apg, ppo, or mpc: image dynamics learned from as many samples, and planning towards a goal picture."""
+    """apg, ppo, or mpc: image dynamics learned from as many samples, and planning towards a goal picture; the two plans
+    that one would try first are flown beside it."""
     seed: int = 0
     """Seed of everything that is drawn."""
     target: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
@@ -35,7 +38,7 @@ class Options:
     updates: int | None = None
     """Gradient steps (apg)."""
     episodes: int | None = None
-    """Test episodes (default: 50; 10 for mpc)."""
+    """Test episodes (default: 50; 20 for mpc)."""
     video: bool = True
     """Write balance.mp4."""
     out: str | None = None
@@ -59,8 +62,11 @@ def main(options):
     metrics = {"system": task.system.name, "method": options.method, "target": " ".join(options.target) or "source"}
     metrics |= {"metric": task.metric, "unit": task.unit, **result.summary, **steps_survived(task, result), **spent}
     metrics |= {"camera": asdict(task.camera), **info, **command.environment(options.seed, options.threads)}
+    rows = [metrics]
+    if options.method == "mpc":
+        rows += metrics.setdefault("attempts", list(_attempts(options, samples, task, dynamics)))
     command.write_json(folder / "metrics.json", metrics)
-    print(table(metrics))
+    print(table(rows))
     _show(options, actor, task, dynamics, result, folder)
     print(f"results in {folder}/")
 
@@ -98,23 +104,37 @@ def _trained(options, samples, folder):
 
 def _planned(options, samples, folder):
     """Learn image dynamics: (planner, task, dynamics, how it came about)."""
-    from functools import partial
-
-    from tqdm import tqdm
-
     from envs.domains import parse_target
     from envs.registry import make_dynamics, make_task
-    from policies import pixel_mpc
 
     command.output_folder(folder, options.overwrite, RESULTS)
     domain = parse_target(options.target, make_task("cartpole").system)
     task = domain.seen(command.filmed(make_task("cartpole"), options.camera))
     dynamics = make_dynamics(task.system, domain)
-    config = replace(pixel_mpc.Config(), samples=samples)
+    actor, config = _planner(options, samples, task, dynamics)
+    return actor, task, dynamics, {"samples": samples, "training": asdict(config)}
+
+
+def _planner(options, samples, task, dynamics, **settings):
+    """A planner on pictures, and its settings."""
+    from functools import partial
+
+    from tqdm import tqdm
+
+    from policies import pixel_mpc
+
+    config = replace(pixel_mpc.Config(), samples=samples, **settings)
     progress = partial(tqdm, desc="learning image dynamics", leave=False)
     model = pixel_mpc.fit(dynamics, task, config, options.seed, progress)
-    actor = pixel_mpc.actor(model, task, config, options.seed)
-    return actor, task, dynamics, {"samples": samples, "training": asdict(config)}
+    return pixel_mpc.actor(model, task, config, options.seed), config
+
+
+def _attempts(options, samples, task, dynamics):
+    """What comes of the plans that one would try first, as rows of the table."""
+    for name, settings in ATTEMPTS.items():
+        actor, _ = _planner(options, samples, task, dynamics, **settings)
+        result, spent = _flown(options, actor, task, dynamics)
+        yield {"method": name, "samples": samples, **result.summary, **steps_survived(task, result), **spent}
 
 
 def _flown(options, actor, task, dynamics):
@@ -137,15 +157,17 @@ def steps_survived(task, result):
     return {"steps": float(flown.mean())}
 
 
-def table(metrics):
+def table(results):
     """What was reached, as text."""
     from tabulate import tabulate
 
-    good = f"{metrics['mean']:.4f} ± {metrics['std']:.4f}" if metrics["success"] else "none stayed up"
-    row = (metrics["method"], metrics["samples"], good, f"{metrics['success']:.2f}", f"{metrics['steps']:.0f}")
-    row = (*row, metrics["n"], f"{metrics['median_ms']:.2f}")
-    header = ("method", "samples", f"{metrics['metric']} [{metrics['unit']}]", "full episodes", "steps", "N")
-    return "\n" + tabulate([row], (*header, "ms per action"), "simple", disable_numparse=True) + "\n"
+    rows = []
+    for one in results:
+        good = f"{one['mean']:.4f} ± {one['std']:.4f}" if one["success"] else "none stayed up"
+        row = (one["method"], one["samples"], good, f"{one['success']:.2f}", f"{one['steps']:.0f}", one["n"])
+        rows.append((*row, f"{one['median_ms']:.2f}"))
+    header = ("method", "samples", f"{results[0]['metric']} [{results[0]['unit']}]", "full episodes", "steps", "N")
+    return "\n" + tabulate(rows, (*header, "ms per action"), "simple", disable_numparse=True) + "\n"
 
 
 def _show(options, actor, task, dynamics, result, folder):
