@@ -168,12 +168,11 @@ def adapt(
 def _flown(policy, target, task, samples, exploration, seed, device):
     """Transitions of training episodes that the pretraining did not see, and the footage if it sees pictures."""
     episodes = task.episodes(max(20, 2 * samples // task.steps), "train", 1_000_000 + seed).to(device)
-    generator, actor = torch.Generator().manual_seed(seed), policy.actor(seed)
+    generator = torch.Generator().manual_seed(seed)
     if task.camera is None:
-        return collect(
-            actor, tracking_env(target, task, episodes, device=device), samples, exploration, generator
-        ), None
-    footage = filmed(actor, target, task, episodes, samples, exploration, generator)
+        env = tracking_env(target, task, episodes, device=device)
+        return collect(policy.actor(seed), env, samples, exploration, generator), None
+    footage = filmed(policy, target, task, episodes, samples, exploration, generator)
     return film_transitions(footage, task.system), footage
 
 

@@ -1,6 +1,8 @@
 """Fly a policy in a target to record transitions."""
 
+import copy
 import math
+from dataclasses import replace
 
 import torch
 
@@ -78,7 +80,11 @@ def _fly(policy, env, episodes, steps, exploration, generator):
 def filmed(policy, target, task, episodes, n, exploration=0.0, generator=None, flights=10):
     """Fly a policy that sees pictures in a target: `Footage` of `n` steps.
 
+    After a tenth of them it gets used to the brightness of the target: flights of one that is dazzled, and falls at
+    once, teach little.
+
     Args:
+        policy: `Policy`, which stays as it is.
         task: as it is seen in the target; it has a camera.
         flights: how many robots fly side by side; one that falls begins again, so few long flights give way to many.
     """
@@ -89,8 +95,12 @@ def filmed(policy, target, task, episodes, n, exploration=0.0, generator=None, f
     seed = int(torch.randint(2**31, (), generator=generator))
     size = min(flights, n)
     env = tracking_env(target, task, episodes, (size,), episodes.device, seed, threshold=STRAY * task.thresholds[1])
-    footage = Footage.empty(task, episodes.device)
-    film(footage, env, policy, env.reset(), -(-n // size), exploration, generator)
+    footage, now = Footage.empty(task, episodes.device), env.reset()
+    flown = replace(policy, network=copy.deepcopy(policy.network))
+    steps = -(-n // size)
+    for part in (-(-steps // 10), steps - -(-steps // 10)):
+        now = film(footage, env, flown.actor(), now, part, exploration, generator)
+        flown.network.encoder.expose(footage.pixels(torch.arange(len(footage), device=env.device)))
     return footage.first(n)
 
 

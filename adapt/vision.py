@@ -9,7 +9,7 @@ import tyro
 from adapt import command, pretrain
 from envs.errors import InputError
 
-METHODS = {"apg": 1000, "ppo": 200_000, "mpc": 1000}  # steps of the robot that each may use unless told otherwise
+METHODS = {"apg": 1000, "ppo": 150_000, "mpc": 1000}  # steps of the robot that each may use unless told otherwise
 EPISODES = {"mpc": 20}  # test episodes where planning takes too long for all
 # Ways to plan on pictures that one would try first, and what comes of them: settings of `pixel_mpc.Config`.
 ATTEMPTS = {"mpc, distance to the goal alone": {"rest": 0.0}, "mpc, nearest recorded step": {"model": "nearest"}}
@@ -25,7 +25,7 @@ class Options:
     """
 
     samples: int | None = None
-    """Steps of the robot that may be used (default: 1000; 200000 for ppo)."""
+    """Steps of the robot that may be used (default: 1000; 150000 for ppo)."""
     method: str = "apg"
     """apg, ppo, or mpc: image dynamics learned from as many samples, and planning towards a goal picture; the two plans
     that one would try first are flown beside it."""

@@ -170,8 +170,14 @@ def begin(dynamics, task, banks, config, seed, network=None, footage=None):
     run = Training(network, optimizer, generator, env, Footage.empty(task, device) if films else footage, place, films)
     if fresh:
         _film(run, config, 0)
-        network.encoder.normalise(run.footage.pixels(torch.arange(run.samples, device=device)))
+        network.encoder.normalise(_all(run.footage))
+    elif not films:
+        network.encoder.expose(_all(run.footage))
     return run
+
+
+def _all(footage):
+    return footage.pixels(torch.arange(len(footage), device=footage.state.device))
 
 
 def _film(run, config, update):

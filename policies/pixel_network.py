@@ -61,6 +61,16 @@ class PixelEncoder(nn.Module):
         self.mean.copy_(seen.mean(1)[:, None, None])
         self.scale.copy_(seen.std(1).clamp(min=1.0)[:, None, None])
 
+    @torch.no_grad()
+    def expose(self, pixels):
+        """Get used to pictures (N, C, H, W) of another brightness, as an eye does.
+
+        The mean level tells it: unlike spreads and differences it doesn't depend on how the robot moves.
+        """
+        gain = pixels[:, :3].float().mean() / self.mean[:3].mean().clamp(min=1.0)
+        self.mean.mul_(gain)
+        self.scale.mul_(gain)
+
 
 def changes(levels):
     """The newest picture and the differences of each to the one before it: (N, 3 * frames, H, W)."""

@@ -36,7 +36,7 @@ def target_of(policy):
 
 def test_footage_of_a_target_becomes_transitions_in_order_of_time(rough):
     target, seen = target_of(rough)
-    footage = filmed(rough.actor(), target, seen, seen.episodes(20, "train", 1), 105, 0.2)
+    footage = filmed(rough, target, seen, seen.episodes(20, "train", 1), 105, 0.2)
     transitions = film_transitions(footage, seen.system)
     assert len(footage) == len(transitions) == 105
     assert (transitions.trajectory.diff() >= 0).all()
@@ -63,7 +63,7 @@ def test_it_learns_the_difference_and_tunes_a_policy_of_the_same_method(rough):
 
 def test_fine_tuning_lowers_the_cost_of_its_plans_in_the_target(rough):
     target, seen = target_of(rough)
-    footage = filmed(rough.actor(), target, seen, seen.episodes(20, "train", 1), 200, 0.2)
+    footage = filmed(rough, target, seen, seen.episodes(20, "train", 1), 200, 0.2)
     config = replace(finetuning(rough), updates=80, batch=32, learning_rate=3e-3)
     tuned, history = finetune(rough, target, config, 0, footage=footage)
     with torch.no_grad():

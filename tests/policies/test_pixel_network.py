@@ -67,6 +67,18 @@ def test_normalised_channels_have_zero_mean_and_unit_spread():
     torch.testing.assert_close(read.std(1), torch.ones(12), atol=1e-3, rtol=0)
 
 
+def test_once_used_to_the_light_it_acts_in_half_of_it_as_it_did_in_all_of_it():
+    net, seen = network(), (pixels(20) // 2) * 2
+    net.encoder.normalise(seen)
+    with torch.no_grad():
+        bright = net(seen)
+        dazed = net(seen // 2)
+        net.encoder.expose(seen // 2)
+        used = net(seen // 2)
+    torch.testing.assert_close(used, bright, atol=1e-4, rtol=1e-3)
+    assert (dazed - bright).abs().max() > 0.01
+
+
 @pytest.mark.parametrize(
     ("wrong", "found"),
     [

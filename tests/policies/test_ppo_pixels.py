@@ -23,7 +23,16 @@ from policies.pixel_actor_critic import PixelActorCritic, pixel_actor_critic_for
 
 SMALL = Camera(height=16, width=48, scale=9.6)
 TINY = ppo_pixels.Config(
-    samples=96, batch=4, steps=6, least_updates=1, width=8, episodes=6, minibatches=1, epochs=2, critic_epochs=2
+    samples=96,
+    batch=4,
+    steps=6,
+    least_updates=1,
+    width=8,
+    episodes=6,
+    minibatches=1,
+    epochs=2,
+    critic_epochs=2,
+    spread=0.3,
 )
 
 
@@ -267,6 +276,31 @@ def test_who_strays_is_put_back_within_the_threshold_of_the_curriculum():
     assert history[0]["resets"] > 0
 
 
+def test_training_flights_begin_all_over_the_picture_and_like_those_of_the_task_but_for_that():
+    task, _, _ = setting()
+    bank = task.episodes(500, "train", 0)
+    (scattered,) = ppo_pixels._scattered([bank], task, replace(TINY, spread=0.7))
+    assert torch.equal(scattered[:, 1:], bank[:, 1:])
+    offset = scattered[:, 0] - bank[:, 0]
+    assert offset.abs().max() <= 0.7 + 1e-6
+    assert float(offset.mean()) == pytest.approx(0, abs=0.06)
+    assert float(offset.std()) == pytest.approx(0.7 / math.sqrt(3), rel=0.1)  # uniform
+    assert torch.equal(ppo_pixels._scattered([bank], task, replace(TINY, spread=0.7))[0], scattered)
+    assert torch.equal(ppo_pixels._scattered([bank], task, replace(TINY, spread=0.0))[0], bank)
+
+
+def test_robots_start_from_scattered_places_from_the_first_update_on():
+    wide = replace(TINY, samples=6 * 64, batch=64, minibatches=1, epochs=1, spread=1.5)
+    run, rest = begun(wide)
+    assert run.place["state"][:, 0].abs().max() > 1
+    begin = run.place["state"][:, 0].clone()
+    run.place["state"][:, 2] = 1.0  # all fall, and begin again elsewhere
+    list(ppo_pixels.train(run, *rest))
+    again = run.place["state"][:, 0]
+    assert (again - begin).abs().max() > 0.3
+    assert again.abs().max() > 1
+
+
 # --- training --------------------------------------------------------------------------------------------------------
 
 
@@ -337,7 +371,7 @@ def test_fine_tuning_goes_on_with_a_copy():
 @pytest.mark.slow
 def test_training_on_few_pictures_makes_unseen_flights_last_longer():
     task, dynamics = replace(setting()[0], steps=100), setting()[1]
-    config = replace(ppo_pixels.PRESETS["cartpole"], samples=16_000, episodes=200)
+    config = replace(ppo_pixels.PRESETS["cartpole"], samples=16_000, episodes=200, spread=0.0)
     banks = training_banks(task, config, 0)
     run = ppo_pixels.begin(dynamics, task, banks, config, 0)
     unseen = task.episodes(20, "validation", 0)
@@ -392,6 +426,23 @@ def test_advantages_are_those_of_the_critic_after_its_last_pass():
     torch.testing.assert_close(flown["advantage"], expected, rtol=1e-3, atol=1e-3)
 
 
-def test_a_negative_number_of_passes_is_refused():
-    with pytest.raises(InputError, match=r"^ppo.Config.critic_epochs -1: expected at least 0"):
-        ppo_pixels.Config(critic_epochs=-1)
+def test_training_lets_the_critic_take_its_own_passes_in_every_update():
+    run, _ = finished(replace(TINY, critic_epochs=3))
+    state = run.optimizer.state_dict()["state"]
+    steps = [int(each["step"]) for each in state.values()]
+    assert set(steps) == {min(steps), min(steps) + 3 * run.update}  # of the policy, and of the critic
+    assert min(steps) >= run.update
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("critic_epochs", -1, "ppo.Config.critic_epochs -1: expected at least 0"),
+        ("spread", -0.1, "ppo_pixels.Config.spread -0.1: expected at least 0"),
+        ("spread", math.nan, "ppo_pixels.Config.spread nan: expected at least 0"),
+        ("samples", 0, "--samples 0: expected at least 1"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused_by_name(field, value, message):
+    with pytest.raises(InputError, match="^" + message):
+        ppo_pixels.Config(**{field: value})
