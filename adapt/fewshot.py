@@ -238,6 +238,7 @@ def _metrics(options, policy, adaptation, validation):
         "system": options.vehicle or task.system.name,
         "set": task.set,
         "target": _target_text(options),
+        "method": policy.method,
         "metric": task.metric,
         "unit": task.unit,
         "samples": len(adaptation.transitions),

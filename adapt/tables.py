@@ -1,7 +1,7 @@
 """Tables of several runs: `python -m adapt.tables runs/fewshot-* --csv results/fewshot.csv`.
 
-Reads the metrics.json of `adapt.fewshot` or the JSON of `adapt.evaluate`, writes one CSV row per run, and prints the
-mean and standard deviation over seeds as Markdown.
+Reads the metrics.json of `adapt.fewshot` and `adapt.vision` or the JSON of `adapt.evaluate`, writes one CSV row per run,
+and prints the mean and standard deviation over seeds as Markdown.
 """
 
 import json
@@ -26,7 +26,7 @@ class Options:
     """Collect the results of several runs into a CSV and a Markdown table with mean and spread over seeds."""
 
     runs: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Folders of adapt.fewshot, or JSON files of adapt.evaluate."""
+    """Folders of adapt.fewshot or adapt.vision, or JSON files of adapt.evaluate."""
     csv: str | None = None
     """File for one row per run."""
     overwrite: bool = False
@@ -38,9 +38,10 @@ def main(options):
     import pandas as pd
 
     _check(options)
-    table = pd.DataFrame([_row(Path(run)) for run in options.runs])
+    rows = {run: _rows(Path(run)) for run in options.runs}
+    table = pd.DataFrame([row for part in rows.values() for row in part])
     keys = [key for key in GROUP if key in table]
-    _refuse_repeated(table[[*keys, "seed"]], options.runs)
+    _refuse_repeated(table[[*keys, "seed"]], [run for run, part in rows.items() for _ in part])
     table = table.sort_values([*keys, "seed"], ignore_index=True)
     if options.csv:
         with replacing(options.csv) as partial:
@@ -87,20 +88,23 @@ def _spread(values, digits=4):
     return f"{values.mean():.{digits}f} ± {values.std(ddof=0):.{digits}f}"
 
 
-def _row(run):
+def _rows(run):
     path = run / "metrics.json" if run.is_dir() else run
     try:
         metrics = json.loads(path.read_text())
-        return _fewshot_row(path, metrics) if "few_shot" in metrics else _evaluation_row(metrics)
+        if "few_shot" in metrics:
+            return [_fewshot_row(path, metrics)]
+        return _vision_rows(metrics) if "camera" in metrics else [_evaluation_row(metrics)]
     except OSError as error:
         raise InputError(f"{path}: can't be read ({error.strerror}); name folders of adapt.fewshot") from None
     except (ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: holds no results of adapt.fewshot or adapt.evaluate") from None
+        raise InputError(f"{path}: holds no results of adapt.fewshot, adapt.vision or adapt.evaluate") from None
 
 
 def _fewshot_row(path, metrics):
     row = {key: metrics[key] for key in ("system", "target", "samples", "seed", "metric", "unit")}
     row |= {key: metrics[key] for key in ("set", "updates") if key in metrics}  # older files don't have them
+    row |= {"method": metrics["method"]} if "method" in metrics else {}
     row |= {"residual": metrics["residual"]["kind"]} if metrics.get("residual") else {}
     for stage in STAGES:
         if stage in metrics:
@@ -110,6 +114,18 @@ def _fewshot_row(path, metrics):
     own = sum(seconds for name, seconds in metrics["seconds"].items() if name != "oracle")
     config = json.loads((path.parent / "config.json").read_text())
     return row | {"seconds": own, "threads": metrics["threads"], "torch": config["torch"], "commit": config["commit"]}
+
+
+def _vision_rows(metrics):
+    """One row, and one for each other attempt of a planner."""
+    same = ("system", "target", "samples", "seed", "metric", "unit", "threads", "torch", "commit")
+    spent = {"seconds": metrics["training"].get("seconds"), "updates": metrics["training"].get("update")}
+    return [
+        {**{key: metrics[key] for key in same}, "method": f"{one['method']} from pictures", **spent}
+        | _figures("error", one)
+        | {key: one[key] for key in ("steps", "median_ms", "p99_ms")}
+        for one in (metrics, *metrics.get("attempts", ()))
+    ]
 
 
 def _figures(name, summary):

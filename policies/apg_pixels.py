@@ -51,8 +51,8 @@ class Config:
     mirror: bool = True
     brightness: float = 0.0  # [-] most that the brightness of a picture is changed to either side
     episodes: int = 1000  # training episodes drawn
-    every: ClassVar[int] = 200  # updates between validations, unless another number is asked for
-    validations: ClassVar[int] = 20  # episodes flown in each
+    every: ClassVar[int] = 250  # updates between validations, unless another number is asked for
+    validations: ClassVar[int] = 10  # episodes flown in each
 
     def __post_init__(self):
         for name in ("samples", "rounds", "flights", "updates", "batch", "episodes"):
