@@ -13,7 +13,7 @@ from adapt import residual as residuals
 from adapt.flying import collect, film_transitions, filmed
 from adapt.prediction import prediction_error
 from adapt.residual_dynamics import ResidualDynamics
-from adapt.transitions import Transitions
+from adapt.transitions import Transitions, joined
 from envs.dynamics import Dynamics
 from envs.errors import InputError
 from envs.pixels import tracking_env
@@ -21,6 +21,8 @@ from policies import METHODS
 from policies.checkpoints import Policy
 from policies.evaluate import Evaluation, evaluate, test_episodes
 
+PICTURE_ROUNDS = 5
+APART = 1_000  # between the seeds of the training episodes of two rounds
 HELD_OUT = 1000  # transitions flown for the report alone, to measure the prediction error
 
 
@@ -51,7 +53,7 @@ def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None)
     Args:
         dynamics: anything that is differentiable, such as a fitted residual.
         config: of the policy's method; None is `finetuning(policy)`.
-        progress: wraps the iterable of updates, as `tqdm` does.
+        progress: wraps the iterable of updates and takes its length as `total`, as `tqdm` does.
         footage: for a policy that sees pictures: `Footage` of the target, from whose pictures it learns.
 
     Returns:
@@ -62,7 +64,7 @@ def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None)
     filmed = {} if footage is None else {"footage": footage}
     run = method.begin(dynamics, policy.task, [bank], config, seed, policy.network, **filmed)
     updates = method.train(run, dynamics, policy.task, [bank], config)
-    history = list(progress(updates) if progress else updates)
+    history = list(progress(updates, total=config.updates) if progress else updates)
     if run.skipped == config.updates:
         raise InputError("fine-tuning: no update had a finite gradient; the residual may be of the wrong scale")
     info = {**policy.info, "finetuned_updates": run.update, "finetune_seed": seed}
@@ -84,6 +86,7 @@ def adapt(
     transitions=None,
     kind="acceleration",
     exploration=0.1,
+    rounds=None,
     seed=0,
     config=None,
     oracle=False,
@@ -103,11 +106,13 @@ def adapt(
         transitions: recorded `Transitions` to learn from instead.
         kind: of the residual, "acceleration" or "state".
         exploration: standard deviation of noise on the actions flown for data.
+        rounds: parts that the transitions are flown in, each by the policy tuned on those before (default: 1, or 5
+            for a policy that sees pictures: it knows no states but those that it was filmed in).
         config: of the fine-tuning, see `finetune`.
         oracle: also fine-tune for as long in the true target, as a bound of what data could give.
         context: values of the residual's context while the policy is tuned and evaluated (default: the recorded mean).
         seen: the task as it is seen in the target (default: as the policy knows it); its camera may be another.
-        progress: wraps iterables of updates, as `tqdm` does.
+        progress: see `finetune`.
         stage: called with the name of each stage as it begins.
         keep: called with "transitions", "residual" and "policy" and the result, as soon as each exists.
 
@@ -125,14 +130,18 @@ def adapt(
     seen = seen or task
     device = next(policy.network.parameters()).device
     tests = test_episodes(task).to(device)
-    actor, footage = policy.actor(seed), None
+    actor, footage, begun = policy.actor(seed), None, policy
     clock.next("evaluate")
     evaluations = {"source": evaluate(actor, source, task, tests)}
     clock.next("collect")
     held_out = None
     if target is not None:
         if transitions is None:
-            transitions, footage = _flown(policy, target, seen, samples, exploration, seed, device)
+            rounds = rounds or (PICTURE_ROUNDS if METHODS[policy.method].pixels else 1)
+            settings = {"kind": kind, "config": config or finetuning(policy), "progress": progress}
+            begun, transitions, footage = _collected(
+                policy, target, seen, samples, rounds, exploration, seed, device, **settings
+            )
         unseen = task.episodes(20, "validation", seed).to(device)
         held_out = collect(actor, tracking_env(target, seen, unseen, device=device), HELD_OUT)
     if transitions.context is not None:
@@ -151,7 +160,7 @@ def adapt(
     # A copy: what is returned stays on the CPU, where the transitions are.
     learned = copy.deepcopy(residual if context is None else residual.with_context(context)).to(device)
     clock.next("finetune")
-    tuned, history = finetune(policy, learned, config, seed, progress, footage)
+    tuned, history = finetune(begun, learned, config, seed, progress, footage)
     keep("policy", tuned)
     clock.next("evaluate")
     truth = target if target is not None else learned
@@ -160,9 +169,24 @@ def adapt(
     best = None
     if oracle:
         clock.next("oracle")
-        best, _ = finetune(policy, target, config, seed, progress, footage)
+        best, _ = finetune(begun, target, config, seed, progress, footage)
         evaluations["oracle"] = evaluate(best.actor(seed), target, seen, tests)
     return Adaptation(tuned, residual, transitions, fit, evaluations, prediction, history, clock.stop(), best)
+
+
+def _collected(policy, target, task, samples, rounds, exploration, seed, device, *, kind, config, progress):
+    """Fly, fit, tune, fly: the policy of the last round, all transitions, and all footage if it sees pictures."""
+    transitions = footage = None
+    for number in range(rounds):
+        share = samples * (number + 1) // rounds - samples * number // rounds
+        part, film = _flown(policy, target, task, share, exploration, seed + APART * number, device)
+        transitions = part if transitions is None else joined((transitions, part))
+        footage = film if footage is None else footage.joined(film)
+        if number + 1 < rounds:
+            residual, _ = residuals.fit_residual(transitions, Dynamics(policy.task.system), kind, seed)
+            briefly = replace(config, updates=max(1, config.updates // 3))
+            policy, _ = finetune(policy, residual.to(device), briefly, seed, progress, footage)
+    return policy, transitions, footage
 
 
 def _flown(policy, target, task, samples, exploration, seed, device):

@@ -43,6 +43,8 @@ class Options:
     """Kind of residual: acceleration, or state as in the paper."""
     exploration: float = 0.1
     """Standard deviation of noise on the actions flown for data, which span -1 to 1."""
+    rounds: int | None = None
+    """Parts that transitions are flown in, each by the policy tuned on those before (default: 1; 5 with --pixels)."""
     updates: int | None = None
     """Gradient steps of the fine-tuning (default: 200; 600 with --log, as a real robot is farther from its model)."""
     oracle: bool = False
@@ -115,6 +117,9 @@ def _check(options):
 
     if options.residual not in RESIDUALS:
         raise InputError(f"--residual {options.residual}: expected one of {', '.join(RESIDUALS)}")
+    if options.rounds is not None and not 1 <= options.rounds <= max(1, options.samples // MINIMUM):
+        least = f"at least {MINIMUM} transitions in each"
+        raise InputError(f"--rounds {options.rounds}: expected at least 1, and {least}")
     if options.samples < MINIMUM:
         raise InputError(f"--samples {options.samples}: a residual needs at least {MINIMUM} transitions")
 
@@ -188,6 +193,8 @@ def _default_folder(options):
 
 
 def _adapt(options, setting, policy, recorded, folder, device):
+    from functools import partial
+
     from tqdm import tqdm
 
     from adapt.adaptation import adapt, finetuning
@@ -214,11 +221,12 @@ def _adapt(options, setting, policy, recorded, folder, device):
             transitions=recorded,
             kind=options.residual,
             exploration=options.exploration,
+            rounds=options.rounds,
             seed=options.seed,
             config=replace(finetuning(policy), updates=updates),
             seen=setting.domain and setting.domain.seen(policy.task),
             oracle=options.oracle,
-            progress=lambda steps: tqdm(steps, total=updates, desc="fine-tuning", unit="update"),
+            progress=partial(tqdm, desc="fine-tuning", unit="update"),
             stage=lambda name: print(f"{name} ...", flush=True),
             keep=keep,
         )

@@ -235,7 +235,7 @@ def closed_loop(options, policy, targets, dynamics, seen):
     config = replace(usual, updates=options.updates or usual.updates)
 
     def tuned(model, text):
-        return finetune(policy, model, config, options.seed, _progress(text, config.updates))[0]
+        return finetune(policy, model, config, options.seed, _progress(text))[0]
 
     middle = tuned(dynamics["context_free"], "context-free")
     flights = {}
@@ -248,10 +248,12 @@ def closed_loop(options, policy, targets, dynamics, seen):
     return flights
 
 
-def _progress(text, total):
+def _progress(text):
+    from functools import partial
+
     from tqdm import tqdm
 
-    return lambda steps: tqdm(steps, total=total, desc=text, unit="update")
+    return partial(tqdm, desc=text, unit="update")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from envs.errors import InputError
 from policies import pick_method
 
 OUTPUTS = ("policy.safetensors", "log.csv", "training.pt")
-SETTINGS = ("updates", "samples", "batch", "width", "learning_rate", "curriculum", "exploration")
+SETTINGS = ("mode", "updates", "samples", "batch", "width", "learning_rate", "curriculum", "exploration")
 UNNAMED = ("out", "overwrite", "resume", "device", "threads")  # options that don't change what is trained
 
 
@@ -41,6 +41,10 @@ class Options:
     """Setting of the camera that a policy from pictures sees through, such as height=64; may be repeated."""
     set: str | None = None
     """Family of training episodes (quadrotor: paper, fast)."""
+    horizon: int | None = None
+    """Control periods ahead that a policy sees of the reference, plans or is trained on (default: 10)."""
+    mode: str | None = None
+    """How actions follow one another in training (apg): concurrent (default), autoregressive or recurrent (LSTM)."""
     seed: int = 0
     """Seed of everything that is drawn."""
     preset: str | None = None
@@ -88,6 +92,7 @@ def main(options):
     system, _ = command.pick_robot(options.system, options.vehicle)
     config = configuration(options, system)
     policy = _policy(options, system)
+    config = _as_policy(config, policy)
     task, dynamics = _setting(options, system, policy)
     task.episodes(1, "train", options.seed)  # what can't be flown is told before anything is written
     folder = _folder(options, system)
@@ -123,8 +128,11 @@ def check(options):
         raise InputError(f"--every {options.every}: expected at least 1")
     if options.residual and options.target:
         raise InputError("--residual: the robot is the model with the residual then; leave --target out")
-    if options.policy and options.width is not None:
-        raise InputError("--width: is that of the policy that --policy names; leave it out")
+    if options.horizon is not None and options.horizon < 1:
+        raise InputError(f"--horizon {options.horizon}: expected at least 1")
+    for name in ("width", "mode", "horizon"):
+        if options.policy and getattr(options, name) is not None:
+            raise InputError(f"--{name}: is that of the policy that --policy names; leave it out")
     if options.compile and not options.method.startswith("apg"):
         raise InputError(
             f"--compile: is for apg, which differentiates the dynamics; {options.method} has no use for it"
@@ -159,12 +167,19 @@ def _policy(options, system):
     return load_policy(options.policy, system, options.method)
 
 
+def _as_policy(config, policy):
+    """The settings with the mode of the policy to go on with, so that what is written tells what was done."""
+    mode = policy and getattr(policy.network.config, "mode", None)
+    return replace(config, mode=mode) if mode else config
+
+
 def _setting(options, system, policy):
     """What is asked of the robot, and what the policy is trained in."""
     from envs import make_dynamics, make_task, parse_target
 
     domain = parse_target(options.target, system)
-    task = make_task(system, options.set)
+    horizon = policy.task.horizon if policy else options.horizon
+    task = make_task(system, options.set, **({} if horizon is None else {"horizon": horizon}))
     if pick_method(options.method).pixels:
         task = replace(task, camera=policy.task.camera) if policy else command.filmed(task, options.camera)
     task = domain.seen(task)
@@ -192,7 +207,7 @@ def _identity(options, task, config):
     robot = {"system": task.system.name, "vehicle": repr(task.system), "target": " ".join(options.target)}
     robot |= {"camera": repr(task.camera)} if task.camera else {}
     start = {name: getattr(options, name) for name in ("method", "policy", "residual")}
-    return {**robot, **start, "set": task.set, "seed": options.seed, **asdict(config)}
+    return {**robot, **start, "set": task.set, "horizon": task.horizon, "seed": options.seed, **asdict(config)}
 
 
 def _info(options):

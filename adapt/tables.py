@@ -1,7 +1,7 @@
 """Tables of several runs: `python -m adapt.tables runs/fewshot-* --csv results/fewshot.csv`.
 
-Reads the metrics.json of `adapt.fewshot` and `adapt.vision` or the JSON of `adapt.evaluate`, writes one CSV row per run,
-and prints the mean and standard deviation over seeds as Markdown.
+Reads the metrics.json of `adapt.fewshot` and `adapt.vision` or the JSON of `adapt.evaluate`, writes one CSV row per
+run, and prints the mean and standard deviation over seeds as Markdown.
 """
 
 import json

@@ -125,6 +125,18 @@ class Transitions:
         return transitions
 
 
+def joined(parts):
+    """Transitions of one robot one after another; trajectories of different parts stay apart."""
+    first, names = parts[0], ("state", "action", "next_state")
+    trajectory, begun = [], 0
+    for part in parts:
+        trajectory.append(part.trajectory - part.trajectory.min() + begun)
+        begun = int(trajectory[-1].max()) + 1
+    tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    context = None if first.context is None else torch.cat([part.context for part in parts])
+    return replace(first, **tensors, trajectory=torch.cat(trajectory), context=context)
+
+
 def check(transitions, system=None, minimum=1, source="transitions"):
     """Refuse transitions that nothing can be learned from, or that are of another robot than `system`.
 

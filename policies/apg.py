@@ -1,8 +1,9 @@
 """Analytic policy gradient: train a policy by differentiating the task's cost through the dynamics.
 
 Wiedemann, Wuest, Loquercio, Mueller, Floreano and Scaramuzza (2023), "Training Efficient Controllers via Analytic
-Policy Gradient": receding horizon, all actions of the horizon planned at once, data collected by the partly trained
-policy, a curriculum over the allowed divergence and the speed of the reference. Where we differ: see `APGConfig`.
+Policy Gradient": receding horizon, data collected by the partly trained policy, a curriculum over the allowed
+divergence and the speed of the reference. All actions of the horizon are planned at once, or one after another: see
+`policies.modes`. Where we differ: see `APGConfig`.
 """
 
 import copy
@@ -13,7 +14,9 @@ from typing import ClassVar, Literal
 import torch
 
 from envs.errors import InputError
-from policies.networks import PlanNetwork, as_actor, network_for
+from policies.modes import look_ahead
+from policies.modes import plan_cost as plan_cost  # a name of this module for those that train otherwise
+from policies.networks import MODES, PlanNetwork, as_actor, network_for
 
 OPTIMIZERS = {
     "adam": lambda parameters: torch.optim.Adam(parameters),
@@ -28,11 +31,14 @@ class APGConfig:
     The paper alternates between collecting a data set and epochs of SGD on it. Here many episodes are flown side by
     side and each update advances all of them by one step, so that the data are always those of the present policy; the
     optimiser is Adam with a falling learning rate.
+
+    The mode is that of a new network. Training that goes on with a network goes on in the network's mode.
     """
 
     updates: int = 3000
     batch: int = 256  # episodes flown side by side
     width: int | None = None  # neurons of every layer of the network; None: those of the paper
+    mode: Literal["concurrent", "autoregressive", "recurrent"] = "concurrent"  # see `policies.networks`
     learning_rate: float = 3e-3
     final_rate: float = 0.01  # [-] last learning rate as a share of the first
     warmup: float = 0.02  # [-] share of the updates in which the learning rate rises
@@ -50,13 +56,15 @@ class APGConfig:
         for name in ("final_rate", "warmup", "curriculum", "exploration"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"{_called(name)} {getattr(self, name)}: expected between 0 and 1")
+        if self.mode not in MODES:
+            raise InputError(f"{_called('mode')} {self.mode}: expected one of {', '.join(MODES)}")
         if self.optimizer not in OPTIMIZERS:
             raise InputError(f"{_called('optimizer')} {self.optimizer!r}: expected one of {', '.join(OPTIMIZERS)}")
 
 
 def _called(name):
     """A setting as the user gave it: an option of the commands, or a field where there is none."""
-    options = ("updates", "batch", "width", "learning_rate", "curriculum", "exploration")
+    options = ("mode", "updates", "batch", "width", "learning_rate", "curriculum", "exploration")
     return f"--{name.replace('_', '-')}" if name in options else f"APGConfig.{name}"
 
 
@@ -81,7 +89,7 @@ Config, Network = APGConfig, PlanNetwork  # the names that every trained method 
 
 
 def actor(network, task, seed=0):
-    """The first action of the network's plan, as a TensorDict module; nothing is drawn, the seed doesn't matter."""
+    """The network's next action, as a TensorDict module; nothing is drawn, the seed doesn't matter."""
     return as_actor(network)
 
 
@@ -96,14 +104,18 @@ def finetuning(config):
 
 
 class Flight:
-    """Episodes flown side by side by the partly trained policy."""
+    """Episodes flown side by side by the partly trained policy.
 
-    def __init__(self, task, dynamics, episodes, size, generator):
+    What the policy remembers of each, `hidden` (B, 2, memory), is carried along; None where it has no memory.
+    """
+
+    def __init__(self, task, dynamics, episodes, size, generator, memory=0):
         self.task, self.dynamics, self.generator = task, dynamics, generator
         self.episodes = episodes
         self.row = self._draw(len(episodes), size)
         self.step = self._draw(task.steps, size)
         self.state = task.start(episodes[self.row], self.step)
+        self.hidden = self.state.new_zeros(size, 2, memory) if memory else None
 
     def _draw(self, limit, size):
         return torch.randint(limit, (size,), generator=self.generator).to(self.episodes.device)
@@ -112,15 +124,23 @@ class Flight:
         """Continue on other episodes, such as faster ones."""
         self.episodes = episodes
         self.state = self.task.start(episodes[self.row], self.step)
+        self.hidden = None if self.hidden is None else torch.zeros_like(self.hidden)
 
     def look(self):
         """The present states and the references ahead of them."""
-        rows = self.episodes[self.row]
-        return self.state, self.task.reference(rows, self.step, self.state)
+        return self.state, self.ahead(0, self.state)
+
+    def ahead(self, periods, state):
+        """The references ahead of the states (B, n) that so many control periods from now lead to."""
+        return self.task.reference(self.episodes[self.row], self.step + periods, state)
 
     @torch.no_grad()
-    def advance(self, action, threshold, exploration):
-        """One control period; who strays farther than the threshold is put back on the reference."""
+    def advance(self, action, threshold, exploration, hidden=None):
+        """One control period; who strays farther than the threshold is put back on the reference.
+
+        Args:
+            hidden: what the policy remembers now. Nothing where an episode begins or is put back.
+        """
         task = self.task
         noise = exploration * torch.randn(action.shape, generator=self.generator).to(action)
         self.state = self.dynamics(self.state, (action + noise).clamp(-1, 1))
@@ -134,16 +154,9 @@ class Flight:
         self.step = torch.where(ended, torch.zeros_like(self.step), self.step)
         back = (strayed | ended).unsqueeze(-1)
         self.state = torch.where(back, task.start(self.episodes[self.row], self.step), self.state)
+        if hidden is not None:
+            self.hidden = torch.where(back.unsqueeze(-1), torch.zeros_like(hidden), hidden)
         return strayed.float().mean()
-
-
-def plan_cost(dynamics, task, state, plan, reference):
-    """Cost (B,) of a plan (B, T, m) from state (B, n) against reference (B, T, r), differentiable in all of them."""
-    states = []
-    for action in plan.unbind(-2):
-        state = dynamics(state, action)
-        states.append(state)
-    return task.cost(torch.stack(states, -2), plan, reference).sum(-1)
 
 
 def learning_rate(config, update):
@@ -186,6 +199,8 @@ class Training:
     def state_dict(self):
         """Tensors and numbers only."""
         flight = {name: getattr(self.flight, name) for name in ("row", "step", "state")}
+        if self.flight.hidden is not None:
+            flight["hidden"] = self.flight.hidden
         return {
             "network": self.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -210,16 +225,21 @@ def begin(dynamics, task, banks, config, seed, network=None):
     """A training run at its first update, of a copy of the network.
 
     Without a network, a new one is drawn from the seed and normalised.
+
+    Raises:
+        InputError: where the settings ask for another mode than that of the network.
     """
     generator = torch.Generator().manual_seed(seed)
     if network is None:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            network = network_for(task, config.width).to(banks[0].device)
+            network = network_for(task, config.width, mode=config.mode).to(banks[0].device)
         normalise(network, task, dynamics, banks[-1], generator)
     else:
+        if config.mode not in (APGConfig.mode, network.config.mode):  # the default is not asked for
+            raise InputError(f"--mode {config.mode}: the policy is {network.config.mode} and stays so; leave it out")
         network = copy.deepcopy(network)
-    flight = Flight(task, dynamics, banks[0], config.batch, generator)
+    flight = Flight(task, dynamics, banks[0], config.batch, generator, network.config.memory)
     return Training(network, OPTIMIZERS[config.optimizer](network.parameters()), flight, generator)
 
 
@@ -243,9 +263,8 @@ def train(run, dynamics, task, banks, config):
             run.flight.switch(banks[bank])
         for group in run.optimizer.param_groups:
             group["lr"] = learning_rate(config, run.update)
-        state, reference = run.flight.look()
-        plan = run.network(task.observe(state), task.window(state, reference))
-        cost = plan_cost(dynamics, task, state, plan, reference).mean()
+        ahead = look_ahead(run.network, dynamics, task, run.flight)
+        cost = ahead.cost.mean()
         run.optimizer.zero_grad(set_to_none=True)
         cost.backward()
         norm = torch.nn.utils.clip_grad_norm_(parameters, config.clip)
@@ -253,7 +272,7 @@ def train(run, dynamics, task, banks, config):
             run.optimizer.step()
         else:
             run.skipped += 1
-        resets = run.flight.advance(plan[:, 0].detach(), threshold, config.exploration)
+        resets = run.flight.advance(ahead.action.detach(), threshold, config.exploration, ahead.hidden)
         run.update += 1
         yield {
             "update": run.update,

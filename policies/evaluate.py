@@ -92,9 +92,9 @@ def action_time(actor, dynamics, task, calls=300):
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             for _ in range(WARM_UP + calls):
                 begin = time.perf_counter()
-                action = actor(flown.seen())["action"]
+                answer = actor(flown.seen())
                 seconds.append(time.perf_counter() - begin)
-                flown.advance(action)
+                flown.advance(answer)
     finally:
         torch.set_num_threads(threads)
     seconds = seconds[WARM_UP:]
@@ -112,7 +112,7 @@ class FlightForTiming:
     def _begin(self, episode):
         self.episode, self.step = torch.tensor([episode % len(self.episodes)]), torch.zeros(1, dtype=torch.long)
         self.state = self.task.start(self.episodes[self.episode], self.step)
-        self.pictures = None
+        self.pictures, self.memory = None, {}
 
     def seen(self):
         """What a policy reads, computed now."""
@@ -122,7 +122,7 @@ class FlightForTiming:
         place = {"state": state, "episode": self.episode.unsqueeze(-1), "step": self.step.unsqueeze(-1)}
         if task.camera is not None:
             seen["pixels"] = self._stacked()
-        return TensorDict({**seen, **place}, batch_size=(1,))
+        return TensorDict({**seen, **place, **self.memory}, batch_size=(1,))
 
     def _stacked(self):
         """The last pictures; the present one is drawn now."""
@@ -132,9 +132,10 @@ class FlightForTiming:
         self.pictures = torch.cat((picture, older), 1)
         return self.pictures
 
-    def advance(self, action):
-        """One control period; the next episode where this one has ended."""
-        self.state, self.step = self.dynamics(self.state, action), self.step + 1
+    def advance(self, answer):
+        """One control period with the `action` of a policy's answer; the next episode where this one has ended."""
+        self.memory = dict(answer.get("next", {}))  # what a recurrent policy remembers
+        self.state, self.step = self.dynamics(self.state, answer["action"]), self.step + 1
         place = self.episodes[self.episode], self.step, self.state
         ended = (self.step >= self.task.steps) | self.task.diverged(*place) | self.task.arrived(*place)
         if bool(ended):

@@ -49,6 +49,12 @@ class Footage:
         """The first `n` steps; no stack of theirs holds a later picture."""
         return Footage(**{name: part[:n] for name, part in self.tensors().items()})
 
+    def joined(self, other):
+        """This footage with another behind it."""
+        ahead = {"stacks": len(self), "flight": int(self.flight.max()) + 1 if len(self) else 0}
+        parts = {name: part + ahead[name] if name in ahead else part for name, part in other.tensors().items()}
+        return Footage(**{name: torch.cat((getattr(self, name), part)) for name, part in parts.items()})
+
     def tensors(self):
         """Everything by name."""
         return {item.name: getattr(self, item.name) for item in fields(self)}

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from adapt import adaptation
 from adapt.adaptation import Clock, adapt, finetune
 from adapt.flying import collect
 from adapt.residual import MINIMUM
@@ -210,7 +211,7 @@ def test_finetuning_trains_on_training_episodes_only(rough_cartpole, target, mon
 def test_progress_wraps_the_updates(rough_cartpole, target):
     seen = []
 
-    def watched(updates):
+    def watched(updates, total):
         for metrics in updates:
             seen.append(metrics["update"])
             yield metrics
@@ -242,3 +243,19 @@ def test_a_quadrotor_learns_a_drag_from_ten_seconds_of_flight(rough_quadrotor):
     assert isinstance(result.transitions, Transitions)
     assert mean(result, "few_shot") < 0.6 * mean(result, "zero_shot")
     assert mean(result, "few_shot") < 1.25 * mean(result, "oracle")
+
+
+def test_in_rounds_each_part_is_flown_by_the_policy_tuned_on_those_before(rough_cartpole, target, monkeypatch):
+    flown = []
+    whole = adaptation._flown
+
+    def noted(policy, *rest):
+        flown.append(policy)
+        return whole(policy, *rest)
+
+    monkeypatch.setattr(adaptation, "_flown", noted)
+    result = adapt(rough_cartpole, target, samples=100, rounds=3, config=replace(QUICK, updates=3))
+    assert flown[0] is rough_cartpole
+    assert len({id(policy) for policy in flown}) == 3
+    assert len(result.transitions) == 100
+    assert len(result.history) == 3

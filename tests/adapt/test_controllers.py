@@ -80,7 +80,7 @@ def test_learning_for_a_planner_is_the_learning_of_few_shot_adaptation(rough_car
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--method", "magic"), "--method magic: expected one of apg, ppo, pets, mpc"),
+        (("--method", "magic"), "--method magic: expected one of apg, apg-pixels, ppo, ppo-pixels, pets, mpc"),
         (("--method", "mpc", "--policy", "a.safetensors"), "--policy: --method mpc has no use for it, only apg"),
         (("--method", "apg", "--solver", "rti"), "--solver: --method apg has no use for it, only mpc, mpc-residual"),
         (("--method", "apg", "--horizon", "5"), "--horizon: --method apg has no use for it"),

@@ -50,7 +50,7 @@ def test_it_learns_the_difference_and_tunes_a_policy_of_the_same_method(rough):
     target, seen = target_of(rough)
     config = replace(finetuning(rough), updates=5, batch=16)
     before = {name: value.clone() for name, value in rough.network.state_dict().items()}
-    result = adapt(rough, target, samples=200, exploration=0.2, config=config, seen=seen, oracle=True)
+    result = adapt(rough, target, samples=200, exploration=0.2, config=config, seen=seen, oracle=True, rounds=2)
     assert result.policy.method == "apg-pixels"
     assert set(result.evaluations) == {"source", "zero_shot", "few_shot", "oracle"}
     assert result.prediction["model + residual"]["velocity"] < 0.3 * result.prediction["model"]["velocity"]
@@ -87,7 +87,19 @@ def checkpoint(rough, tmp_path):
 
 
 def test_the_command_adapts_it_and_writes_everything(call, checkpoint, tmp_path):
-    options = ("--system", "cartpole", "--pixels", "--policy", checkpoint, "--samples", 60, "--updates", 3)
+    options = (
+        "--system",
+        "cartpole",
+        "--pixels",
+        "--policy",
+        checkpoint,
+        "--samples",
+        60,
+        "--updates",
+        3,
+        "--rounds",
+        2,
+    )
     answer = call("fewshot", *options, *(f"--target={item}" for item in TARGET.split()), "--out", tmp_path / "run")
     assert answer.status == 0, answer.errors
     written = {path.name for path in (tmp_path / "run").iterdir()}
@@ -104,6 +116,11 @@ def test_the_command_adapts_it_and_writes_everything(call, checkpoint, tmp_path)
         (("--system", "quadrotor", "--pixels"), "--policy: none ships for quadrotor by apg-pixels"),
         (("--system", "cartpole", "--target", "blur=2"), "--target blur=2: changes the picture, but this policy sees"),
         (("--system", "cartpole", "--pixels", "--transitions", "t.csv"), "--pixels: learns from pictures"),
+        (("--system", "cartpole", "--rounds", "0"), "--rounds 0: expected at least 1"),
+        (
+            ("--system", "cartpole", "--samples", "30", "--rounds", "4"),
+            "--rounds 4: expected at least 1, and at least 10",
+        ),
         (("--system", "cartpole", "--pixels", "--target", "height=64"), "cartpole has no 'height'"),
     ],
 )

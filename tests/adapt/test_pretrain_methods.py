@@ -100,7 +100,7 @@ def test_a_policy_can_be_trained_in_a_model_with_a_residual(call, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--method", "mpc"), "--method mpc: expected one of apg, ppo, pets"),
+        (("--method", "mpc"), "--method mpc: expected one of apg, apg-pixels, ppo, ppo-pixels, pets"),
         (("--method", "ppo", "--samples", "0"), "--samples 0: expected at least 1"),
         (("--method", "pets", "--samples", "0"), "--samples 0: expected at least 1"),
         (("--method", "apg", "--samples", "100"), "--samples: apg has no such setting"),

@@ -116,3 +116,31 @@ def test_a_csv_is_written_only_where_it_can_be_and_nothing_is_lost(call, refused
     assert path.read_text() == "mine"
     assert call("tables", run, "--csv", path, "--overwrite").status == 0
     assert len(pd.read_csv(path)) == 1
+
+
+def test_runs_from_pictures_make_a_row_for_each_way_that_was_tried(call, tmp_path):
+    same = {"steps": 250.0, "median_ms": 1.0, "p99_ms": 2.0}
+    metrics = {
+        "system": "cartpole",
+        "target": "source",
+        "samples": 1000,
+        "metric": "speed",
+        "unit": "m/s",
+        "threads": 1,
+    }
+    metrics |= {"camera": {"height": 48}, **ENVIRONMENT, **SUMMARY, **same}
+    for seed in (0, 1):
+        trained = {"method": "apg", "seed": seed, "training": {"seconds": 9.0, "update": 50}}
+        planned = {"method": "mpc", "seed": seed, "training": {}}
+        planned |= {"attempts": [{"method": "mpc, other", **SUMMARY, **same, "mean": None, "success": 0.0}]}
+        for own in (trained, planned):
+            (tmp_path / f"{own['method']}{seed}").mkdir()
+            (tmp_path / f"{own['method']}{seed}" / "metrics.json").write_text(json.dumps(metrics | own))
+    answer = call("tables", *sorted(tmp_path.iterdir()), "--csv", tmp_path / "vision.csv")
+    assert answer.status == 0, answer.errors
+    table = pd.read_csv(tmp_path / "vision.csv")
+    assert table.method.value_counts().to_dict() == {
+        f"{name} from pictures": 2 for name in ("apg", "mpc", "mpc, other")
+    }
+    assert table.error_mean[table.method.str.contains("other")].isna().all()
+    assert (table.seconds[table.method.str.startswith("apg")] == 9.0).all()

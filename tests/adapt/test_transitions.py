@@ -215,3 +215,15 @@ def test_shapes_that_do_not_fit_are_refused(flights):
 def test_nonsense_is_not_flown(n, exploration):
     with pytest.raises(InputError, match="collect"):
         flown(n=n, exploration=exploration)
+
+
+def test_joined_parts_keep_their_trajectories_apart():
+    from adapt.transitions import joined
+
+    states = torch.arange(5.0).unsqueeze(-1).expand(-1, 4)
+    trajectory = torch.tensor([3, 3, 4, 4, 4])
+    names = (make_system("cartpole").State._fields, make_system("cartpole").Action._fields)
+    part = Transitions(states, states[:, :1], states + 1, trajectory, 0.05, "cartpole", *names)
+    both = joined((part, part))
+    assert both.trajectory.tolist() == [0, 0, 1, 1, 1, 2, 2, 3, 3, 3]
+    assert torch.equal(both.next_state, torch.cat((part.next_state, part.next_state)))

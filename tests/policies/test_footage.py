@@ -58,3 +58,11 @@ def test_a_policy_is_followed_but_for_the_noise():
     film(footage, env, policy, env.reset(), 25, 0.1, torch.Generator().manual_seed(0))
     assert abs(float(footage.action.mean()) - 0.5) < 0.02
     assert abs(float(footage.action.std()) - 0.1) < 0.02
+
+
+def test_joined_footage_shows_what_both_parts_show_and_keeps_their_flights_apart():
+    (one, first), (two, second) = flown(20, seed=1), flown(15, seed=2)
+    both = one.joined(two)
+    assert torch.equal(both.pixels(torch.arange(len(both))), torch.cat((first, second)))
+    assert not set(both.flight[:60].tolist()) & set(both.flight[60:].tolist())
+    assert torch.equal(Footage.empty(TASK).joined(one).stacks, one.stacks)

@@ -6,7 +6,7 @@ from tensordict import TensorDict
 
 from envs import SYSTEMS, make_task
 from envs.errors import InputError
-from policies.networks import NetworkConfig, PlanNetwork, as_actor, network_for
+from policies.networks import MODES, NetworkConfig, PlanNetwork, as_actor, network_for
 
 
 @pytest.fixture(params=SYSTEMS)
@@ -52,6 +52,58 @@ def test_the_horizon_of_the_task_sets_the_length_of_the_plan(horizon):
     task = make_task("quadrotor", horizon=horizon)
     network = network_for(task)
     assert network(*seen_by(task, 2, dtype=torch.float32)).shape == (2, horizon, 4)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("horizon", [1, 2])
+def test_a_window_shorter_than_a_filter_is_read_whole(horizon, mode):
+    task = make_task("quadrotor", horizon=horizon)
+    network = network_for(task, mode=mode).double()
+    assert network.window_layer.kernel_size == (horizon,)
+    observation, window = (z.requires_grad_() for z in seen_by(task, 4))
+    plan = network(observation, window)
+    assert plan.shape == (4, network.config.planned, 4)
+    plan.sum().backward()
+    assert (window.grad != 0).any(0).all()
+
+
+@pytest.mark.parametrize("mode", ["autoregressive", "recurrent"])
+def test_a_network_that_is_called_at_every_step_gives_one_action(task, mode):
+    network = network_for(task, mode=mode).double()
+    observation, window = seen_by(task, 6)
+    plan = network(observation, window)
+    assert plan.shape == (6, 1, len(task.system.Action._fields))
+    folded = network(observation.unflatten(0, (2, 3)), window.unflatten(0, (2, 3)))
+    torch.testing.assert_close(folded, plan.unflatten(0, (2, 3)))
+    assert network(1e3 * observation, 1e3 * window).abs().max() <= 1
+
+
+def test_the_memory_of_a_network_may_have_any_batch_shape(task):
+    network = network_for(task, 16, mode="recurrent").double()
+    observation, window = seen_by(task, 6)
+    _, hidden = network.recall(observation, window)
+    assert hidden.shape == (6, 2, 16)
+    plan, later = network.recall(observation, window, hidden)
+    folded = network.recall(*(part.unflatten(0, (2, 3)) for part in (observation, window, hidden)))
+    torch.testing.assert_close(folded, (plan.unflatten(0, (2, 3)), later.unflatten(0, (2, 3))))
+    alone = network.recall(observation[4], window[4], hidden[4])
+    torch.testing.assert_close(alone, (plan[4], later[4]))
+
+
+def test_a_network_without_a_memory_hands_it_on_as_it_is(task):
+    network = network_for(task, 8, mode="autoregressive").double()
+    seen = seen_by(task, 2)
+    for hidden in (None, "anything"):
+        plan, kept = network.recall(*seen, hidden)
+        assert kept is hidden
+        assert torch.equal(plan, network(*seen))
+
+
+def test_the_modes_differ_in_nothing_but_head_and_memory():
+    task = make_task("quadrotor")
+    sizes = {mode: sum(p.numel() for p in network_for(task, mode=mode).parameters()) for mode in MODES}
+    assert sizes["concurrent"] - sizes["autoregressive"] == 36 * (64 + 1)
+    assert sizes["recurrent"] - sizes["autoregressive"] == 4 * 64 * (64 + 64 + 2)
 
 
 def test_the_quadrotor_network_is_that_of_the_paper():
@@ -148,3 +200,8 @@ def test_normalisation_is_saved_with_the_weights_but_not_trained(task):
 def test_an_unknown_encoder_is_refused():
     with pytest.raises(InputError, match="encoder 'lstm': expected one of conv, linear, none"):
         PlanNetwork(NetworkConfig(3, (5, 2), 1, 2, "lstm"))
+
+
+def test_an_unknown_mode_is_refused():
+    with pytest.raises(InputError, match="mode 'chained': expected one of concurrent, autoregressive, recurrent"):
+        PlanNetwork(NetworkConfig(3, (5, 2), 1, 2, "linear", mode="chained"))
