@@ -8,7 +8,7 @@ from adapt import adaptation
 from adapt.residual_kinds import make_residual
 from envs import make_dynamics
 from envs.errors import InputError
-from policies import METHODS
+from policies import METHODS, apg
 from policies.checkpoints import save_policy
 
 
@@ -71,7 +71,7 @@ def test_learning_for_a_planner_is_the_learning_of_few_shot_adaptation(rough_car
     target = make_dynamics("cartpole", "push=1")
     transitions, residual, _ = adaptation.learn(rough_cartpole, target, 40, seed=2)
     whole = adaptation.adapt(
-        rough_cartpole, target, samples=40, seed=2, config=adaptation.apg.APGConfig(updates=1, batch=2, episodes=2)
+        rough_cartpole, target, samples=40, seed=2, config=apg.APGConfig(updates=1, batch=2, episodes=2)
     )
     assert transitions.state.equal(whole.transitions.state)
     assert residual.weights.equal(whole.residual.weights)
