@@ -16,7 +16,7 @@ from pathlib import Path
 from envs.errors import InputError
 from policies.files import whole
 
-USAGE, INTERRUPTED = 2, 130  # exit statuses
+USAGE, INTERRUPTED, READER_GONE = 2, 130, 141  # exit statuses
 FULL_OR_FORBIDDEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EROFS, errno.EPERM)
 
 
@@ -29,10 +29,14 @@ def run(name, options, main):
     prefix = f"{name.split('.')[-1]}: "
     try:
         main(_parse(name, options))
+        sys.stdout.flush()
     except InputError as error:
         sys.exit(_fail(prefix, str(error), USAGE))
     except KeyboardInterrupt as interrupt:
         sys.exit(_fail(prefix, f"interrupted; {interrupt}" if str(interrupt) else "interrupted", INTERRUPTED))
+    except BrokenPipeError:  # the reader of what is printed has gone, as `head` does; the interpreter must not flush
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(READER_GONE)
     except OSError as error:
         if error.filename is None and error.errno not in FULL_OR_FORBIDDEN:  # no path of the user's: a fault of ours
             raise

@@ -244,3 +244,13 @@ def test_results_say_what_they_were_made_with():
     assert made_with["threads"] == 2
     assert made_with["torch"] == torch.__version__
     assert {"python", "torchrl", "tensordict", "casadi", "commit"} <= made_with.keys()
+
+
+def test_a_reader_that_leaves_early_is_no_error_of_ours():
+    program = "from adapt import command; command._parse = lambda *_: None; "
+    program += "command.run('adapt.x', None, lambda options: print('a' * 200000))"
+    line = f'set -o pipefail; {sys.executable} -c "{program}" | head -c 10'
+    answer = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=False)
+    assert answer.returncode == 141
+    assert answer.stdout == 10 * "a"
+    assert answer.stderr == ""
