@@ -89,8 +89,12 @@ PRESETS = {"cartpole": Config()}
 
 
 def finetuning(config):
-    """Settings to continue the training of a policy that was trained with `config`."""
-    return replace(config, rounds=1, updates=300, learning_rate=5e-4)
+    """Settings to continue the training of a policy that was trained with `config`.
+
+    No smaller learning rate: with a quarter of it the error in a target stayed twice as large after as many updates
+    (validation, another background).
+    """
+    return replace(config, rounds=1, updates=500)
 
 
 def actor(network, task, seed=0):
