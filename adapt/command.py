@@ -162,8 +162,11 @@ def pick_policy(path, system, vehicle, method="apg"):
     Raises:
         InputError: when there is none, or it was trained for another robot or by another method.
     """
+    from policies import METHODS
     from policies.checkpoints import load_policy, pretrained
 
+    if METHODS[method].pixels and not system.drawn:
+        raise InputError(f"--system {system.name}: can't be drawn, so no policy can see it; choose cartpole")
     name = vehicle.name if vehicle else system.name
     if path is None and pretrained(name, method) is None:
         same = f"the same --{'vehicle' if vehicle else 'system'}" + ("" if method == "apg" else " and --method")

@@ -44,8 +44,6 @@ class Pixels(Transform):
         stack = torch.cat(self.camera.frames * [picture], -3)
         if tensordict is not None and {"pixels", "state"} <= set(tensordict.keys()):  # some flights go on
             onward = (tensordict["state"] == tensordict_reset["state"]).all(-1)
-            if "_reset" in tensordict.keys():  # noqa: SIM118
-                onward = onward & ~tensordict["_reset"].squeeze(-1)
             stack = torch.where(onward[..., None, None, None], tensordict["pixels"], stack)
         return tensordict_reset.set("pixels", stack)
 

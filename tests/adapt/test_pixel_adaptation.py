@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from adapt import adapt
+from adapt import adapt, adaptation
 from adapt.adaptation import finetune, finetuning
 from adapt.flying import film_transitions, filmed
 from envs import InputError, make_dynamics, make_task, parse_target
@@ -61,6 +61,19 @@ def test_it_learns_the_difference_and_tunes_a_policy_of_the_same_method(rough):
     assert not all(torch.equal(value, before[name]) for name, value in result.policy.network.state_dict().items())
 
 
+def test_the_target_is_seen_as_it_looks_there_and_the_source_as_it_looks_in_the_model(rough, monkeypatch):
+    target, seen = target_of(rough)
+    shown, whole = [], adaptation.evaluate
+
+    def noted(actor, dynamics, task, episodes):
+        shown.append((dynamics is target, task.camera.brightness))
+        return whole(actor, dynamics, replace(task, steps=2), episodes[:2])
+
+    monkeypatch.setattr(adaptation, "evaluate", noted)
+    adapt(rough, target, samples=60, config=replace(finetuning(rough), updates=3), seen=seen, oracle=True, rounds=1)
+    assert shown == [(False, 1.0), (True, 0.8), (True, 0.8), (True, 0.8)]
+
+
 def test_fine_tuning_lowers_the_cost_of_its_plans_in_the_target(rough):
     target, seen = target_of(rough)
     footage = filmed(rough, target, seen, seen.episodes(20, "train", 1), 200, 0.2)
@@ -113,7 +126,7 @@ def test_the_command_adapts_it_and_writes_everything(call, checkpoint, tmp_path)
 @pytest.mark.parametrize(
     ("options", "line"),
     [
-        (("--system", "quadrotor", "--pixels"), "--policy: none ships for quadrotor by apg-pixels"),
+        (("--system", "quadrotor", "--pixels"), "--system quadrotor: can't be drawn, so no policy can see it"),
         (("--system", "cartpole", "--target", "blur=2"), "--target blur=2: changes the picture, but this policy sees"),
         (("--system", "cartpole", "--pixels", "--transitions", "t.csv"), "--pixels: learns from pictures"),
         (("--system", "cartpole", "--rounds", "0"), "--rounds 0: expected at least 1"),
