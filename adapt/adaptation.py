@@ -109,7 +109,8 @@ def adapt(
         rounds: parts that the transitions are flown in, each by the policy tuned on those before (default: 1, or 5
             for a policy that sees pictures: it knows no states but those that it was filmed in).
         config: of the fine-tuning, see `finetune`.
-        oracle: also fine-tune for as long in the true target, as a bound of what data could give.
+        oracle: also fine-tune for as long in the true target, as a bound of what data could give; with several rounds,
+            from the policy of the last.
         context: values of the residual's context while the policy is tuned and evaluated (default: the recorded mean).
         seen: the task as it is seen in the target (default: as the policy knows it); its camera may be another.
         progress: see `finetune`.
@@ -137,7 +138,8 @@ def adapt(
     held_out = None
     if target is not None:
         if transitions is None:
-            rounds = rounds or (PICTURE_ROUNDS if METHODS[policy.method].pixels else 1)
+            most = PICTURE_ROUNDS if METHODS[policy.method].pixels else 1
+            rounds = rounds or min(most, max(1, samples // residuals.MINIMUM))
             settings = {"kind": kind, "config": config or finetuning(policy), "progress": progress}
             begun, transitions, footage = _collected(
                 policy, target, seen, samples, rounds, exploration, seed, device, **settings

@@ -46,7 +46,8 @@ class Options:
     rounds: int | None = None
     """Parts that transitions are flown in, each by the policy tuned on those before (default: 1; 5 with --pixels)."""
     updates: int | None = None
-    """Gradient steps of the fine-tuning (default: 200; 600 with --log, as a real robot is farther from its model)."""
+    """Gradient steps of the fine-tuning (default: 200; 600 with --log, as a real robot is farther from its model; 500
+    with --pixels, and a third as many after each round but the last)."""
     oracle: bool = False
     """Also fine-tune in the true target, as a bound."""
     seed: int = 0

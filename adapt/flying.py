@@ -100,7 +100,7 @@ def filmed(policy, target, task, episodes, n, exploration=0.0, generator=None, f
     steps = -(-n // size)
     for part in (-(-steps // 10), steps - -(-steps // 10)):
         now = film(footage, env, flown.actor(), now, part, exploration, generator)
-        flown.network.encoder.expose(footage.pixels(torch.arange(len(footage), device=env.device)))
+        flown.network.encoder.expose(footage.frames)
     return footage.first(n)
 
 

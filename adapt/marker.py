@@ -13,6 +13,7 @@ from envs.errors import InputError
 
 OUTPUTS = ("config.json", "metrics.json", "marker.png")
 FLIGHTS = 40  # that the samples are shared out to: many short ones, so that no part of them lacks either pole
+HEAVIEST = 100.0  # [kg] pole that the model is still meant for
 UNSEEN = 1000  # transitions that the one-step error is measured on
 TIPS = {"light": (220, 40, 40), "heavy": (40, 60, 220)}  # red and blue
 RESIDUALS = ("context_free", "conditioned", "true_mass")
@@ -69,9 +70,9 @@ def main(options):
 def _check(options):
     if options.samples < FLIGHTS:
         raise InputError(f"--samples {options.samples}: expected at least {FLIGHTS}, one for each flight")
-    if not 0 < options.light < options.heavy < math.inf:
+    if not 0 < options.light < options.heavy <= HEAVIEST:
         said = f"--light {options.light:g} --heavy {options.heavy:g}"
-        raise InputError(f"{said}: expected masses in kg above 0, the light one first")
+        raise InputError(f"{said}: expected masses above 0 and up to {HEAVIEST:g} kg, the light one first")
     if not 0 <= options.exploration <= 1:
         raise InputError(f"--exploration {options.exploration:g}: expected between 0 and 1")
     if options.updates is not None and options.updates < 1:

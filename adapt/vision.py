@@ -40,7 +40,7 @@ class Options:
     episodes: int | None = None
     """Test episodes (default: 50; 20 for mpc)."""
     video: bool = True
-    """Write balance.mp4."""
+    """Whether to write balance.mp4."""
     out: str | None = None
     """Folder for the results (default: runs/vision-METHOD-nSAMPLES-seedN)."""
     overwrite: bool = False
@@ -99,7 +99,12 @@ def _trained(options, samples, folder):
     pretrain.main(pretrain.Options("cartpole", method, samples=samples, out=str(folder), **common))
     policy = load_policy(folder / "policy.safetensors", method=method)
     dynamics = make_dynamics(policy.task.system, parse_target(options.target, policy.task.system))
-    return policy.actor(options.seed), policy.task, dynamics, {"samples": samples, "training": policy.info}
+    return (
+        policy.actor(options.seed),
+        policy.task,
+        dynamics,
+        {"samples": policy.info["samples"], "training": policy.info},
+    )
 
 
 def _planned(options, samples, folder):

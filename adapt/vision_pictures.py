@@ -31,9 +31,8 @@ def typical(result):
 def stacks(task, dynamics, states):
     """What the policy saw (T, C, H, W) in the states (T, n) of a flight."""
     pictures = draw(task.camera, dynamics.system, states)
-    older = [torch.cat((pictures[:1].expand(k, -1, -1, -1), pictures[: len(pictures) - k])) for k in range(4)]
-    older += [older[-1]] * (task.camera.frames - 4)
-    return torch.cat(older[: task.camera.frames], 1)
+    steps = torch.arange(len(pictures))
+    return torch.cat([pictures[(steps - k).clamp(min=0)] for k in range(task.camera.frames)], 1)
 
 
 def _image(picture):

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields, replace
 from envs.errors import InputError
 
 BACKGROUNDS = ("plain", "gradient", "checks")
+LARGEST = 2000  # sides of a picture, and what else is counted in pixels
 COLOURS = ("cart_colour", "pole_colour", "tip_colour", "rail_colour", "background_colour")
 
 
@@ -33,12 +34,21 @@ class Camera:
         for name, least in (("height", 8), ("width", 8), ("frames", 1)):
             if not getattr(self, name) >= least:
                 raise InputError(f"camera: {name} is {getattr(self, name)}, expected at least {least}")
+        for name in ("height", "width", "frames"):
+            if getattr(self, name) > LARGEST:
+                raise InputError(f"camera: {name} is {getattr(self, name)}, expected at most {LARGEST}")
         for name in ("scale", "brightness"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"camera: {name} is {getattr(self, name):g}, expected more than 0")
         for name in ("blur", "noise"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"camera: {name} is {getattr(self, name):g}, expected at least 0")
+        for name in ("scale", "blur"):
+            if getattr(self, name) > LARGEST:
+                raise InputError(f"camera: {name} is {getattr(self, name):g}, expected at most {LARGEST}")
+        for name in ("offset_x", "offset_z"):
+            if not math.isfinite(getattr(self, name)):
+                raise InputError(f"camera: {name} is {getattr(self, name):g}, expected a number of metres")
         for name in COLOURS:
             if len(getattr(self, name)) != 3 or not all(0 <= part <= 255 for part in getattr(self, name)):
                 raise InputError(f"camera: {name} is {getattr(self, name)}, expected red,green,blue in 0 ... 255")

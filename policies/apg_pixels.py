@@ -113,6 +113,7 @@ class Training:
     footage: Footage
     place: TensorDict  # where the filmed robots are
     films: bool = True  # whether it films more; not where the footage was given
+    fresh: bool = True  # whether the network was drawn, so that nothing can be flown with it at first
     update: int = 0
     skipped: int = 0  # updates left out because their gradient was not finite
 
@@ -171,17 +172,14 @@ def begin(dynamics, task, banks, config, seed, network=None, footage=None):
     optimizer = torch.optim.AdamW(network.parameters(), weight_decay=config.decay)
     place = env.reset()
     films = footage is None
-    run = Training(network, optimizer, generator, env, Footage.empty(task, device) if films else footage, place, films)
+    footage = Footage.empty(task, device) if films else footage
+    run = Training(network, optimizer, generator, env, footage, place, films, fresh)
+    _film(run, config, 0)
     if fresh:
-        _film(run, config, 0)
-        network.encoder.normalise(_all(run.footage))
-    elif not films:
-        network.encoder.expose(_all(run.footage))
+        network.encoder.normalise(run.footage.pixels(torch.arange(run.samples, device=device)))
+    else:
+        network.encoder.expose(run.footage.frames)
     return run
-
-
-def _all(footage):
-    return footage.pixels(torch.arange(len(footage), device=footage.state.device))
 
 
 def _film(run, config, update):
@@ -189,7 +187,7 @@ def _film(run, config, update):
     steps = (config.filmed(update) - run.samples) // config.side_by_side
     if steps <= 0 or not run.films:
         return
-    untrained = update == 0 and run.samples == 0
+    untrained = run.fresh and run.samples == 0
     noise = config.first_exploration if untrained else config.exploration
     reseed(run.env, int(torch.randint(2**31, (), generator=run.generator)))
     policy = None if untrained else actor(run.network, None)

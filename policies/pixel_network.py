@@ -63,7 +63,7 @@ class PixelEncoder(nn.Module):
 
     @torch.no_grad()
     def expose(self, pixels):
-        """Get used to pictures (N, C, H, W) of another brightness, as an eye does.
+        """Get used to pictures (N, 3, H, W) of another brightness, as an eye does.
 
         The mean level tells it: unlike spreads and differences it doesn't depend on how the robot moves.
         """

@@ -74,6 +74,12 @@ def test_the_target_is_seen_as_it_looks_there_and_the_source_as_it_looks_in_the_
     assert shown == [(False, 1.0), (True, 0.8), (True, 0.8), (True, 0.8)]
 
 
+def test_few_transitions_are_flown_in_as_many_rounds_as_they_last_for(rough):
+    target, seen = target_of(rough)
+    result = adapt(rough, target, samples=25, config=replace(finetuning(rough), updates=3), seen=seen)
+    assert len(result.transitions) == 25
+
+
 def test_fine_tuning_lowers_the_cost_of_its_plans_in_the_target(rough):
     target, seen = target_of(rough)
     footage = filmed(rough, target, seen, seen.episodes(20, "train", 1), 200, 0.2)

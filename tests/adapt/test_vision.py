@@ -4,6 +4,7 @@ import contextlib
 import csv
 import io
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 
 from adapt import training, training_log, vision, vision_pictures
 from envs import make_dynamics
+from envs.camera import Camera
 from policies.checkpoints import load_policy
 
 SMALL = ("--camera", "height=24", "--camera", "width=48", "--camera", "scale=9")
@@ -135,6 +137,15 @@ def test_the_stack_of_a_flight_begins_with_its_first_picture(made):
     seen = vision_pictures.stacks(policy.task, make_dynamics("cartpole"), states)
     assert all(torch.equal(seen[0, :3], seen[0, 3 * k : 3 * k + 3]) for k in range(4))
     assert all(torch.equal(seen[5, 3 * k : 3 * k + 3], seen[5 - k, :3]) for k in range(4))
+
+
+def test_any_number_of_pictures_is_shown_and_a_flight_may_be_short():
+    task = load_task()
+    states = torch.cumsum(0.01 * torch.ones(9, 4), 0)
+    six = replace(task, camera=Camera(height=24, width=48, scale=9.0, frames=6))
+    seen = vision_pictures.stacks(six, make_dynamics("cartpole"), states)
+    assert all(torch.equal(seen[8, 3 * k : 3 * k + 3], seen[8 - k, :3]) for k in range(6))
+    assert vision_pictures.stacks(six, make_dynamics("cartpole"), states[:2]).shape[0] == 2
 
 
 def test_steps_survived_count_to_the_end_of_each_flight():

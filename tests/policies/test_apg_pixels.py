@@ -107,6 +107,17 @@ def test_fine_tuning_on_given_footage_films_nothing_and_leaves_the_old_network_a
     assert not torch.equal(weights(tuned), before)
 
 
+def test_training_that_goes_on_is_filmed_with_the_given_policy():
+    first = trained(replace(TINY, samples=200))
+    config = replace(TINY, samples=400, rounds=1, exploration=0.0)
+    run, _ = begun(config, network=first.network)
+    rows = torch.arange(run.samples)
+    with torch.no_grad():
+        planned = first.network(run.footage.pixels(rows))[:, 0]
+    assert run.samples == 400
+    torch.testing.assert_close(run.footage.action, planned, atol=1e-5, rtol=1e-4)
+
+
 def test_an_update_without_a_finite_gradient_is_left_out_and_counted():
     run, banks = begun()
     before = weights(run).clone()
