@@ -47,8 +47,7 @@ def _save(figure, path):
 
 def draw_frames(task, seen, path):
     """The newest picture at a few moments of a flight."""
-    moments = [0, 5, 10, 20, 40, 80]
-    moments = [step for step in moments if step < len(seen)]
+    moments = [step for step in (0, 5, 10, 20, 40, 80) if step < len(seen)]
     with matplotlib.rc_context({**STYLE, "axes.grid": False}):
         figure = Figure(figsize=(7, 0.35 + 1.28 * -(-len(moments) // 2)), layout="constrained")
         axes = figure.subplots(-(-len(moments) // 2), 2, squeeze=False).ravel()
@@ -94,7 +93,7 @@ def draw_saliency(actor, seen, path, step=20):
 
 
 def draw_learning(log, task, path):
-    """Error on validation flights over the samples that were used."""
+    """Error on validation flights over the updates, and how many samples they took in all."""
     with Path(log).open() as file:
         rows = list(csv.DictReader(file))
     samples = np.array([float(row["samples"]) for row in rows])

@@ -15,7 +15,6 @@ import torch
 
 from envs.errors import InputError
 from policies.modes import look_ahead
-from policies.modes import plan_cost as plan_cost  # a name of this module for those that train otherwise
 from policies.networks import MODES, PlanNetwork, as_actor, network_for
 
 OPTIMIZERS = {
@@ -256,34 +255,44 @@ def train(run, dynamics, task, banks, config):
         dynamics: what the gradient flows through; data are collected in those that the run was begun with.
         banks: training episodes of each speed of the curriculum, slowest first.
     """
-    parameters = list(run.network.parameters())
     while run.update < config.updates:
         threshold, bank = stage(config, task, len(banks), run.update)
         if run.flight.episodes is not banks[bank]:
             run.flight.switch(banks[bank])
-        for group in run.optimizer.param_groups:
-            group["lr"] = learning_rate(config, run.update)
         ahead = look_ahead(run.network, dynamics, task, run.flight)
         cost = ahead.cost.mean()
-        run.optimizer.zero_grad(set_to_none=True)
-        cost.backward()
-        norm = torch.nn.utils.clip_grad_norm_(parameters, config.clip)
-        if torch.isfinite(norm):
-            run.optimizer.step()
-        else:
-            run.skipped += 1
+        norm = descend(run, cost, config)
         resets = run.flight.advance(ahead.action.detach(), threshold, config.exploration, ahead.hidden)
         run.update += 1
         yield {
             "update": run.update,
             "samples": run.samples,
             "cost": float(cost.detach()),
-            "gradient_norm": float(norm),
+            "gradient_norm": norm,
             "threshold": threshold,
             "stage": bank,
             "resets": float(resets),
             "skipped": run.skipped,
         }
+
+
+def descend(run, cost, config):
+    """One step of the optimiser down a cost, left out where the gradient is not finite; returns the gradient's norm.
+
+    Args:
+        run: has `network`, `optimizer`, `update` and `skipped`.
+        config: has `clip` and what `learning_rate` reads.
+    """
+    for group in run.optimizer.param_groups:
+        group["lr"] = learning_rate(config, run.update)
+    run.optimizer.zero_grad(set_to_none=True)
+    cost.backward()
+    norm = torch.nn.utils.clip_grad_norm_(run.network.parameters(), config.clip)
+    if torch.isfinite(norm):
+        run.optimizer.step()
+    else:
+        run.skipped += 1
+    return float(norm)
 
 
 def stage(config, task, banks, update):

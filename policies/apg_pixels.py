@@ -17,8 +17,9 @@ from torch import nn
 
 from envs.errors import InputError
 from envs.pixels import PLACE, reseed, tracking_env
-from policies.apg import learning_rate, plan_cost
+from policies.apg import descend
 from policies.footage import STRAY, Footage, film
+from policies.modes import plan_cost
 from policies.networks import FirstAction
 from policies.pixel_network import PixelConfig, PixelNetwork
 
@@ -201,26 +202,17 @@ def train(run, dynamics, task, banks, config):
         run: `Training`, changed in place.
         dynamics: what the gradient flows through; pictures are taken in those that the run was begun with.
     """
-    parameters = list(run.network.parameters())
     while run.update < config.updates:
         _film(run, config, run.update)
-        for group in run.optimizer.param_groups:
-            group["lr"] = learning_rate(config, run.update)
         state, pixels = varied(run.footage, task.system, config, run.generator)
         cost = plan_cost(dynamics, task, state, run.network(pixels), task.reference(None, None, state)).mean()
-        run.optimizer.zero_grad(set_to_none=True)
-        cost.backward()
-        norm = torch.nn.utils.clip_grad_norm_(parameters, config.clip)
-        if torch.isfinite(norm):
-            run.optimizer.step()
-        else:
-            run.skipped += 1
+        norm = descend(run, cost, config)
         run.update += 1
         yield {
             "update": run.update,
             "samples": run.samples,
             "cost": float(cost.detach()),
-            "gradient_norm": float(norm),
+            "gradient_norm": norm,
             "skipped": run.skipped,
         }
 

@@ -12,8 +12,8 @@ from adapt.flying import film_transitions, filmed
 from envs import InputError, make_dynamics, make_task, parse_target
 from envs.camera import Camera
 from policies import apg_pixels
-from policies.apg import plan_cost
 from policies.checkpoints import Policy, load_policy, save_policy
+from policies.modes import plan_cost
 
 TASK = make_task("cartpole", camera=Camera(height=16, width=32, scale=6.0), steps=40)
 TARGET = "pole_mass=x3 brightness=0.8"

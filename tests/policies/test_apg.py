@@ -15,7 +15,7 @@ from adapt.transitions import Transitions
 from envs import SYSTEMS, make_dynamics, make_task
 from envs.env import TrackingEnv
 from envs.errors import InputError
-from policies import apg, evaluate
+from policies import apg, evaluate, modes
 from policies.networks import as_actor, network_for
 
 QUICK = {
@@ -78,7 +78,7 @@ def test_the_gradient_of_a_plans_cost_is_that_of_finite_differences(name, model)
     observation, window = task.observe(state), task.window(state, reference)
 
     def cost():
-        return apg.plan_cost(dynamics, task, state, network(observation, window), reference).mean()
+        return modes.plan_cost(dynamics, task, state, network(observation, window), reference).mean()
 
     parameters = list(network.parameters())
     gradients = torch.autograd.grad(cost(), parameters)
@@ -106,7 +106,7 @@ def test_the_gradient_is_that_through_a_rollout_of_the_same_actions(name):
     reference = task.reference(episodes, step, state)
     parameters = list(network.parameters())
     plan = 0.1 * network(task.observe(state), task.window(state, reference))  # gentle: a failure would be reset
-    cost = apg.plan_cost(dynamics, task, state, plan, reference).sum()
+    cost = modes.plan_cost(dynamics, task, state, plan, reference).sum()
     expected = torch.autograd.grad(cost, parameters, retain_graph=True)
 
     env = TrackingEnv(dynamics, task, episodes, (3,))

@@ -18,9 +18,9 @@ from envs.dynamics import Dynamics
 from envs.errors import InputError
 from envs.system import System, Task
 from policies import generated_code, mpc_solvers
-from policies.apg import plan_cost
 from policies.evaluate import evaluate
 from policies.evaluate import test_episodes as held_back
+from policies.modes import plan_cost
 from policies.mpc import MPC
 
 SOLVERS = ("fatrop", "rti", "ipopt")
