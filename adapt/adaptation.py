@@ -47,7 +47,7 @@ def finetuning(policy):
     return method.finetuning(method.PRESETS.get(policy.task.system.name, method.Config()))
 
 
-def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None):
+def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None, judge=None):
     """Continue the training of a policy in other dynamics; the given policy stays as it is.
 
     Args:
@@ -55,20 +55,31 @@ def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None)
         config: of the policy's method; None is `finetuning(policy)`.
         progress: wraps the iterable of updates and takes its length as `total`, as `tqdm` does.
         footage: for a policy that sees pictures: `Footage` of the target, from whose pictures it learns.
+        judge: called with the network and the number of each update; returns what is added to its metrics.
 
     Returns:
-        the new `Policy` and the metrics of each update.
+        the new `Policy` and the metrics of each update, with the `seconds` spent until then without judging.
     """
     method, config = METHODS[policy.method].module, config or finetuning(policy)
     bank = policy.task.episodes(config.episodes, "train", seed).to(next(policy.network.parameters()).device)
     filmed = {} if footage is None else {"footage": footage}
     run = method.begin(dynamics, policy.task, [bank], config, seed, policy.network, **filmed)
-    updates = method.train(run, dynamics, policy.task, [bank], config)
+    updates = _judged(method.train(run, dynamics, policy.task, [bank], config), run, judge)
     history = list(progress(updates, total=config.updates) if progress else updates)
     if run.skipped == config.updates:
         raise InputError("fine-tuning: no update had a finite gradient; the residual may be of the wrong scale")
     info = {**policy.info, "finetuned_updates": run.update, "finetune_seed": seed}
     return Policy(run.network, policy.task, info, policy.method), history
+
+
+def _judged(updates, run, judge):
+    """The metrics of each update with the time spent on training and what a judge says."""
+    seconds, begun = 0.0, time.perf_counter()
+    for metrics in updates:
+        seconds += time.perf_counter() - begun
+        said = judge(run.network, metrics["update"]) if judge else {}
+        yield {**metrics, "seconds": seconds, **said}
+        begun = time.perf_counter()
 
 
 def learn(policy, target, samples, kind="acceleration", exploration=0.1, seed=0):
@@ -90,6 +101,7 @@ def adapt(
     seed=0,
     config=None,
     oracle=False,
+    watch=None,
     context=None,
     seen=None,
     progress=None,
@@ -111,6 +123,9 @@ def adapt(
         config: of the fine-tuning, see `finetune`.
         oracle: also fine-tune for as long in the true target, as a bound of what data could give; with several rounds,
             from the policy of the last.
+        watch: every so many updates of the fine-tuning the policy is flown over validation episodes in the target (or
+            what stands in for it), and `error` and `success` are added to the history: to see it work, at the price of
+            flights that `samples` doesn't count. Nothing is chosen by them.
         context: values of the residual's context while the policy is tuned and evaluated (default: the recorded mean).
         seen: the task as it is seen in the target (default: as the policy knows it); its camera may be another.
         progress: see `finetune`.
@@ -161,11 +176,12 @@ def adapt(
         prediction = {name: prediction_error(dynamics, held_out) for name, dynamics in both}
     # A copy: what is returned stays on the CPU, where the transitions are.
     learned = copy.deepcopy(residual if context is None else residual.with_context(context)).to(device)
+    truth = target if target is not None else learned
+    judge = watch and Judge(policy, truth, seen, watch)
     clock.next("finetune")
-    tuned, history = finetune(begun, learned, config, seed, progress, footage)
+    tuned, history = finetune(begun, learned, config, seed, progress, footage, judge)
     keep("policy", tuned)
     clock.next("evaluate")
-    truth = target if target is not None else learned
     evaluations["zero_shot"] = evaluate(actor, truth, seen, tests)
     evaluations["few_shot"] = evaluate(tuned.actor(seed), truth, seen, tests)
     best = None
@@ -200,6 +216,23 @@ def _flown(policy, target, task, samples, exploration, seed, device):
         return collect(policy.actor(seed), env, samples, exploration, generator), None
     footage = filmed(policy, target, task, episodes, samples, exploration, generator)
     return film_transitions(footage, task.system), footage
+
+
+class Judge:
+    """Flies a network over validation episodes every so many updates."""
+
+    def __init__(self, policy, dynamics, task, every, episodes=50):
+        self.policy, self.dynamics, self.task, self.every = policy, dynamics, task, every
+        self.episodes = test_episodes(task, episodes, "validation")
+
+    def __call__(self, network, update):
+        """`error` and `success`, or nothing after the updates between."""
+        if update % self.every:
+            return {}
+        device = next(network.parameters()).device
+        actor = replace(self.policy, network=network).actor()
+        summary = evaluate(actor, self.dynamics, self.task, self.episodes.to(device)).summary
+        return {"error": summary["mean"], "success": summary["success"]}
 
 
 class Clock:

@@ -195,6 +195,20 @@ def interrupts_noted():
         signal.signal(signal.SIGINT, before)
 
 
+@contextlib.contextmanager
+def terminated_as_interrupted():
+    """A block in which SIGTERM, which schedulers send before they kill, ends like Ctrl-C."""
+
+    def interrupt(number, frame):
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def check_seed(seed):
     """Refuse a seed that generators can't take.
 

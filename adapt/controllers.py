@@ -12,11 +12,12 @@ SAMPLES = 1000  # transitions that the residual of a planner is fitted to unless
 
 @dataclass(frozen=True)
 class Controller:
-    """A TensorDict policy that writes `action`, the task it flies, and how it came about."""
+    """A TensorDict policy that writes `action`, its task, how it came about, and the network of a trained one."""
 
     actor: object
     task: object
     info: dict = field(default_factory=dict)
+    network: object | None = None
 
 
 def check(options):
@@ -73,7 +74,7 @@ def obtain(options, system, vehicle, target, device="cpu"):
         policy = command.pick_policy(options.policy, system, vehicle, options.method)
         policy.network.to(device)
         task = replace(policy.task, set=options.set) if options.set else policy.task
-        return Controller(policy.actor(options.seed), task, policy.info)
+        return Controller(policy.actor(options.seed), task, policy.info, policy.network)
     task = make_task(system, options.set, **({"horizon": options.horizon} if options.horizon is not None else {}))
     model, info = _model(method.model, options, system, vehicle, target)
     settings = {"compile": options.compile, "solver": options.solver or SOLVER}

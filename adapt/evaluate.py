@@ -1,6 +1,6 @@
 """Fly a controller of any method over the test episodes: `python -m adapt.evaluate --system quadrotor --method mpc`."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Annotated
 
 import tyro
@@ -43,6 +43,11 @@ class Options:
     """Compile the solver of a planner to machine code (needs a C compiler; kept for the next time)."""
     horizon: int | None = None
     """Control periods that a planner looks ahead (default: those of the task)."""
+    episodes_horizon: int | None = None
+    """Horizon that the episodes are drawn for, as random paths differ with it (default: that of the controller). Give
+    the longest to fly controllers of several horizons on the same paths."""
+    gradient: bool = False
+    """Also measure norm and variance of the analytic policy gradient over validation episodes (apg)."""
     out: str | None = None
     """File for the results as JSON."""
     overwrite: bool = False
@@ -67,18 +72,22 @@ def main(options):
     dynamics = make_dynamics(system, domain)
     controller = controllers.obtain(options, system, vehicle, dynamics, device)
     task, actor = domain.seen(controller.task), controller.actor
-    episodes = test_episodes(task, options.episodes, options.split, options.seed).to(device)
+    drawn = replace(task, horizon=_episodes_horizon(options, task))
+    episodes = test_episodes(drawn, options.episodes, options.split, options.seed).to(device)
     result = evaluate(actor, dynamics, task, episodes, _progress(options))
     counts = {name: getattr(actor, name) for name in ("calls", "failures") if hasattr(actor, name)}
     spent = action_time(actor.to("cpu"), dynamics, task)
+    gradient = _gradient(controller.network, dynamics, task) if options.gradient else {}
     flown = f"{options.system} {task.set} {' '.join(options.target) or 'source'}"
     print(f"{flown}, {options.method}: {task.metric} {result}")
     print(f"time per action: median {spent['median_ms']:.3f} ms, 99th percentile {spent['p99_ms']:.3f} ms, one thread")
     if counts:
         print(f"failed plans: {counts['failures']} of {counts['calls']}, each replaced by the one before")
+    if gradient:
+        print(f"gradient: norm {gradient['gradient_norm']:.3g}, variance {gradient['gradient_variance']:.3g}")
     if out:
         content = {"options": asdict(options), "method": options.method, "set": task.set, "horizon": task.horizon}
-        content |= {"metric": task.metric, "unit": task.unit, **result.summary, **spent, **counts}
+        content |= {"metric": task.metric, "unit": task.unit, **result.summary, **spent, **counts, **gradient}
         content |= {"policy_info": controller.info, "table": result.table.to_dict("list")}
         command.write_json(out, content | command.environment(options.seed, options.threads))
         print(f"results in {out}")
@@ -93,8 +102,27 @@ def check(options):
         raise InputError(f"--split {options.split}: expected one of {', '.join(SPLITS)}")
     if options.episodes is not None and options.episodes < 1:
         raise InputError(f"--episodes {options.episodes}: expected at least 1")
+    if options.gradient and options.method != "apg":
+        raise InputError(f"--gradient: is that of apg, {options.method} has none; leave it out")
     command.check_seed(options.seed)
     return command.output_file("--out", options.out, options.overwrite, "metrics.json")
+
+
+def _episodes_horizon(options, task):
+    """The horizon to draw episodes for, at least that of the controller: its references must not end before it does."""
+    horizon = options.episodes_horizon or task.horizon
+    if horizon < task.horizon:
+        raise InputError(
+            f"--episodes-horizon {horizon}: expected at least {task.horizon}, the horizon of the controller"
+        )
+    return horizon
+
+
+def _gradient(network, dynamics, task):
+    from policies.gradients import gradient_statistics
+
+    found = gradient_statistics(network.to("cpu"), dynamics, task, task.episodes(200, "validation", 0))
+    return {f"gradient_{name}": value for name, value in found.items()}
 
 
 def _progress(options):

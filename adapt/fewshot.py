@@ -13,7 +13,7 @@ import tyro
 from adapt import command, report
 from envs.errors import InputError
 
-RESULTS = ("config.json", "metrics.json", "policy.safetensors", "residual.safetensors", "transitions.csv")
+RESULTS = ("config.json", "metrics.json", "policy.safetensors", "residual.safetensors", "transitions.csv", "tuning.csv")
 PICTURES = ("flight.png", "error.png", "residual.png", "training.png", "flight.mp4")
 DEFAULT_TARGET = ("drag=0.3",)
 LOG_UPDATES = 600
@@ -24,7 +24,8 @@ Repeatable = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 class Options:
     """Adapt a policy to a target from few transitions and show what it was worth.
 
-    Writes metrics.json, config.json, policy.safetensors, residual.safetensors, transitions.csv and pictures.
+    Writes metrics.json, config.json, policy.safetensors, residual.safetensors, transitions.csv, tuning.csv (each
+    update of the fine-tuning) and pictures.
     """
 
     samples: int = 1000
@@ -50,6 +51,9 @@ class Options:
     with --pixels, and a third as many after each round but the last)."""
     oracle: bool = False
     """Also fine-tune in the true target, as a bound."""
+    watch: int | None = None
+    """Updates between flights over validation episodes in the target during the fine-tuning, for tuning.csv (default:
+    none; a real robot offers no such flights, and nothing is chosen by them)."""
     seed: int = 0
     """Seed of everything that is drawn."""
     transitions: str | None = None
@@ -87,13 +91,25 @@ def main(options):
     folder = command.output_folder(options.out or _default_folder(options), options.overwrite, outputs)
     adaptation = _adapt(options, setting, policy, recorded, folder, device)
     metrics = _metrics(options, policy, adaptation, validation)
+    _write_tuning(adaptation.history, folder / "tuning.csv")
     command.write_json(folder / "metrics.json", metrics)
     print(report.table(metrics))
     _pictures(options, adaptation, folder)
     print(f"results in {folder}/: metrics.json, policy.safetensors, residual.safetensors, transitions.csv, pictures")
 
 
+def _write_tuning(history, path):
+    import pandas as pd
+
+    from policies.files import whole
+
+    with whole(path) as partial:
+        pd.DataFrame(history).to_csv(partial, index=False)
+
+
 def _check(options):
+    if options.watch is not None and options.watch < 1:
+        raise InputError(f"--watch {options.watch}: expected at least 1")
     if options.updates is not None and options.updates < 1:
         raise InputError(f"--updates {options.updates}: expected at least 1")
     if not 0 <= options.exploration <= 1:
@@ -227,6 +243,7 @@ def _adapt(options, setting, policy, recorded, folder, device):
             config=replace(finetuning(policy), updates=updates),
             seen=setting.domain and setting.domain.seen(policy.task),
             oracle=options.oracle,
+            watch=options.watch,
             progress=partial(tqdm, desc="fine-tuning", unit="update"),
             stage=lambda name: print(f"{name} ...", flush=True),
             keep=keep,

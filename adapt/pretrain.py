@@ -11,7 +11,7 @@ from envs.errors import InputError
 from policies import pick_method
 
 OUTPUTS = ("policy.safetensors", "log.csv", "training.pt")
-SETTINGS = ("mode", "updates", "samples", "batch", "width", "learning_rate", "curriculum", "exploration")
+SETTINGS = ("mode", "updates", "samples", "batch", "width", "learning_rate", "curriculum", "ramps", "exploration")
 UNNAMED = ("out", "overwrite", "resume", "device", "threads")  # options that don't change what is trained
 
 
@@ -61,6 +61,8 @@ class Options:
     """First learning rate."""
     curriculum: float | None = None
     """Share of the updates after which the curriculum ends; 0 switches it off."""
+    ramps: str | None = None
+    """What the curriculum raises (apg): both (default), or the threshold of divergence or the speed alone."""
     exploration: float | None = None
     """Standard deviation of noise on the flown actions."""
     every: int | None = None

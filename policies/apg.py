@@ -17,6 +17,7 @@ from envs.errors import InputError
 from policies.modes import look_ahead
 from policies.networks import MODES, PlanNetwork, as_actor, network_for
 
+RAMPS = ("both", "threshold", "speed")
 OPTIMIZERS = {
     "adam": lambda parameters: torch.optim.Adam(parameters),
     "sgd": lambda parameters: torch.optim.SGD(parameters, momentum=0.9),
@@ -44,6 +45,7 @@ class APGConfig:
     optimizer: Literal["adam", "sgd"] = "adam"  # sgd has momentum 0.9
     clip: float = 1.0  # [-] gradients of a larger norm are scaled down to it
     curriculum: float = 0.5  # [-] share of the updates after which the last threshold and speed are reached
+    ramps: Literal["both", "threshold", "speed"] = "both"  # what the curriculum raises; the other has its last value
     exploration: float = 0.1  # [-] standard deviation of noise on the flown actions
     episodes: int = 4000  # training episodes drawn
     every: ClassVar[int] = 500  # updates between validations, unless another number is asked for
@@ -57,13 +59,15 @@ class APGConfig:
                 raise InputError(f"{_called(name)} {getattr(self, name)}: expected between 0 and 1")
         if self.mode not in MODES:
             raise InputError(f"{_called('mode')} {self.mode}: expected one of {', '.join(MODES)}")
+        if self.ramps not in RAMPS:
+            raise InputError(f"{_called('ramps')} {self.ramps}: expected one of {', '.join(RAMPS)}")
         if self.optimizer not in OPTIMIZERS:
             raise InputError(f"{_called('optimizer')} {self.optimizer!r}: expected one of {', '.join(OPTIMIZERS)}")
 
 
 def _called(name):
     """A setting as the user gave it: an option of the commands, or a field where there is none."""
-    options = ("mode", "updates", "batch", "width", "learning_rate", "curriculum", "exploration")
+    options = ("mode", "updates", "batch", "width", "learning_rate", "curriculum", "ramps", "exploration")
     return f"--{name.replace('_', '-')}" if name in options else f"APGConfig.{name}"
 
 
@@ -215,7 +219,7 @@ class Training:
         self.optimizer.load_state_dict(saved["optimizer"])
         self.generator.set_state(saved["generator"])
         self.update, self.skipped = saved["update"], saved["skipped"]
-        self.flight.episodes = banks[stage(config, task, len(banks), max(0, self.update - 1))[1]]
+        self.flight.episodes = banks[stage(config, task, len(banks), max(0, self.update - 1), config.ramps)[1]]
         for name, value in saved["flight"].items():
             setattr(self.flight, name, value.to(self.flight.episodes.device))
 
@@ -256,7 +260,7 @@ def train(run, dynamics, task, banks, config):
         banks: training episodes of each speed of the curriculum, slowest first.
     """
     while run.update < config.updates:
-        threshold, bank = stage(config, task, len(banks), run.update)
+        threshold, bank = stage(config, task, len(banks), run.update, config.ramps)
         if run.flight.episodes is not banks[bank]:
             run.flight.switch(banks[bank])
         ahead = look_ahead(run.network, dynamics, task, run.flight)
@@ -295,11 +299,17 @@ def descend(run, cost, config):
     return float(norm)
 
 
-def stage(config, task, banks, update):
-    """Divergence threshold and speed stage: the threshold rises linearly in each stage and starts again in the next."""
+def stage(config, task, banks, update, ramps="both"):
+    """Divergence threshold and speed stage: the threshold rises linearly in each stage and starts again in the next.
+
+    Args:
+        ramps: "both", or which of "threshold" and "speed" rises alone; the other has its last value from the start.
+    """
     first, last = task.thresholds
     share = update / max(1, config.curriculum * config.updates)
     if share >= 1:
         return last, banks - 1
+    if ramps == "threshold":
+        return first + (last - first) * share, banks - 1
     bank = int(share * banks)
-    return first + (last - first) * (share * banks - bank), bank
+    return last if ramps == "speed" else first + (last - first) * (share * banks - bank), bank

@@ -205,6 +205,22 @@ def test_without_a_curriculum_the_last_threshold_and_full_speed_hold_at_once():
         assert apg.stage(apg.APGConfig(updates=10, curriculum=0.0), task, 3, update) == (2.0, 2)
 
 
+def test_the_threshold_can_rise_alone_at_full_speed_and_the_speed_at_the_last_threshold():
+    task, config = make_task("quadrotor"), apg.APGConfig(updates=600, curriculum=0.5)  # 300 updates of curriculum
+    threshold = [apg.stage(config, task, 3, update, "threshold") for update in (0, 150, 299, 300)]
+    assert threshold == [(0.1, 2), (pytest.approx(1.05), 2), (pytest.approx(2.0, abs=0.01), 2), (2.0, 2)]
+    speed = [apg.stage(config, task, 3, update, "speed") for update in (0, 99, 100, 200, 300)]
+    assert speed == [(2.0, 0), (2.0, 0), (2.0, 1), (2.0, 2), (2.0, 2)]
+
+
+def test_training_raises_what_it_is_told_to():
+    task, config = make_task("quadrotor"), replace(TINY, updates=9, curriculum=1.0, ramps="speed")
+    banks = apg.training_banks(task, config, 0)
+    run = apg.begin(make_dynamics("quadrotor"), task, banks, config, 0)
+    rows = list(apg.train(run, make_dynamics("quadrotor"), task, banks, config))
+    assert [(row["threshold"], row["stage"]) for row in rows] == [(2.0, update // 3) for update in range(9)]
+
+
 def test_training_follows_the_curriculum():
     config = replace(TINY, updates=12, curriculum=0.5)
     _, history = finished("quadrotor", config)
@@ -390,6 +406,7 @@ def test_every_system_has_tuned_settings():
         ("learning_rate", float("nan"), "--learning-rate nan: expected more than 0"),
         ("learning_rate", float("inf"), "--learning-rate inf: expected more than 0"),
         ("curriculum", 1.5, "--curriculum 1.5: expected between 0 and 1"),
+        ("ramps", "up", "--ramps up: expected one of both, threshold, speed"),
         ("exploration", -0.1, "--exploration -0.1: expected between 0 and 1"),
         ("exploration", float("nan"), "--exploration nan: expected between 0 and 1"),
         ("clip", 0.0, "APGConfig.clip 0.0: expected more than 0"),
