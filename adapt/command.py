@@ -59,7 +59,9 @@ def _parse(name, options):
     except SystemExit as leaving:
         if leaving.code in (0, None):
             raise
-    paragraphs = re.split(r"[│|]?\s*─{4,}[^\n]*", re.sub(r"[╭╰][^\n]*", "", message.getvalue()))
+    # The title is part of a frame, or in ASCII a line over dashes.
+    untitled = re.sub(r"[╭╰][^\n]*|\A[^\n]*\n\s*-{4,}\s*\n", "", message.getvalue())
+    paragraphs = re.split(r"[│|]?\s*[─-]{4,}[^\n]*", untitled)
     text = " ".join(re.sub(r"[│╭╮╯╰]", " ", paragraphs[0]).split()) or "bad options"
     raise InputError(f"{text} (see python -m {name} --help)")
 

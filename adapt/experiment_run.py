@@ -47,7 +47,7 @@ def run(name, seed, root):
             return row
         with (folder / "log.txt").open("a") as log, _printed_to(log):
             try:
-                done = [_carry_out(step, root, name, seed) for step in experiment.steps]
+                done = [_carry_out(number, root, name, seed) for number in range(len(experiment.steps))]
             except BaseException as error:
                 traceback.print_exc()
                 if isinstance(error, Exception):
@@ -81,11 +81,16 @@ def curve(root, name, seed):
     return [{"experiment": name, "seed": seed, **{key: row.get(key, "") for key in CURVE}} for row in rows]
 
 
-@lru_cache
 def config_hash(name):
     """A short hash of all that defines an experiment: options, tuned settings, the robot, and the same of its needs."""
+    return step_hash(name, len(EXPERIMENTS[name].steps) - 1)
+
+
+@lru_cache
+def step_hash(name, number):
+    """The same of one step of an experiment and of those before it."""
     experiment = EXPERIMENTS[name]
-    said = [[step.command, step.options, *_settings(step)] for step in experiment.steps]
+    said = [[step.command, step.options, *_settings(step)] for step in experiment.steps[: number + 1]]
     said.append([config_hash(other) for other in experiment.needs])
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:12]
 
@@ -118,17 +123,16 @@ def _resolved(step, root, seed, name="self"):
     return filled | ({"seed": seed} if step.options.get("seed") == "{seed}" else {})
 
 
-def _carry_out(step, root, name, seed):
-    """Run a step unless it is recorded as done; returns the record."""
-    folder = place(root, name, seed)
-    path, wanted = folder / f"{step.out}.step.json", {key: value for key, value in sorted(step.options.items())}
-    wanted = json.loads(json.dumps(wanted))  # as it is read back: lists for tuples
+def _carry_out(number, root, name, seed):
+    """Run a step unless it is recorded as done with the same settings, those of all before it among them."""
+    step, folder = EXPERIMENTS[name].steps[number], place(root, name, seed)
+    path, config = folder / f"{step.out}.step.json", step_hash(name, number)
     record = json.loads(path.read_text()) if path.is_file() else {}
-    same = record.get("command") == step.command and record.get("options") == wanted
+    same = record.get("config") == config
     if same and record.get("done"):
         return record
     module = import_module(step.command)
-    record = {"command": step.command, "options": wanted, "done": False}
+    record = {"command": step.command, "options": step.options, "config": config, "done": False}
     command.write_json(path, record)
     known = {field.name for field in fields(module.Options)}
     out = {"out": str(folder / step.out)}
@@ -150,7 +154,7 @@ def _row(experiment, folder, done):
         for name in ("config.json", "metrics.json"):
             path = folder / last.out / name
             found |= json.loads(path.read_text()) if path.is_file() else {}
-    row = READERS[last.command](found)
+    row = READERS[last.command](found) | _spent(experiment, folder)
     setting = experiment.setting
     row |= {"set": found.get("set", ""), "target": " ".join(setting.get("target", ()))}
     row |= {key: setting.get(key, "") for key in ("horizon", "mode")}
@@ -159,6 +163,15 @@ def _row(experiment, folder, done):
     row |= {"wall_s": round(sum(record["seconds"] for record in done), 1), "threads": found["threads"]}
     row |= {key: found[key] for key in VERSIONS}
     return row | {"commit": " ".join(_commits(experiment, folder, found))}
+
+
+def _spent(experiment, folder):
+    """Samples and seconds of a whole training, not only until the policy that was kept."""
+    log = folder / "training" / "log.csv"
+    if experiment.steps[0].command != "adapt.pretrain" or not log.is_file():
+        return {}
+    last = list(csv.DictReader(log.read_text().splitlines()))[-1]
+    return {"samples": int(last["samples"]), "seconds": round(float(last["seconds"]), 1)}
 
 
 def _commits(experiment, folder, found):
