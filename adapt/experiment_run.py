@@ -48,13 +48,11 @@ def run(name, seed, root):
         with (folder / "log.txt").open("a") as log, _printed_to(log):
             try:
                 done = [_carry_out(number, root, name, seed) for number in range(len(experiment.steps))]
-            except BaseException as error:
+                row = {"experiment": name, "seed": seed, **_row(experiment, folder, done), "config": config}
+            except Exception as error:
                 traceback.print_exc()
-                if isinstance(error, Exception):
-                    told = " ".join(str(error).split()) or type(error).__name__
-                    raise RuntimeError(f"{name} seed {seed}: {told} (log: {folder / 'log.txt'})") from None
-                raise
-        row = {"experiment": name, "seed": seed, **_row(experiment, folder, done), "config": config}
+                told = " ".join(str(error).split()) or type(error).__name__
+                raise RuntimeError(f"{name} seed {seed}: {told} (log: {folder / 'log.txt'})") from None
         command.write_json(folder / "row.json", row)
         return row
 

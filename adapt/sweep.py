@@ -12,6 +12,7 @@ from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from functools import partial
 from graphlib import TopologicalSorter
 
+from adapt.command import INTERRUPTED
 from adapt.experiment_run import finished, run
 from adapt.experiment_table import EXPERIMENTS, needed
 
@@ -139,11 +140,14 @@ class Pool:
 
 
 def _child(name, seed, root):
-    """The process of a run."""
-    with contextlib.suppress(KeyboardInterrupt):
+    """The process of a run. It heeds SIGINT even where the sweep was begun with that ignored, as in the background."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
         run(name, seed, root)
-        return
-    raise SystemExit(130)
+    except KeyboardInterrupt:
+        raise SystemExit(INTERRUPTED) from None
+    except RuntimeError:  # its log says what went wrong
+        raise SystemExit(1) from None
 
 
 def _what_happened(name, seed, root, exitcode):
