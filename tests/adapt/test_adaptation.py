@@ -259,3 +259,11 @@ def test_in_rounds_each_part_is_flown_by_the_policy_tuned_on_those_before(rough_
     assert len({id(policy) for policy in flown}) == 3
     assert len(result.transitions) == 100
     assert len(result.history) == 3
+
+
+def test_to_watch_flies_validation_episodes_in_the_target(rough_cartpole, target):
+    judge = adaptation.Judge(rough_cartpole, target, rough_cartpole.task, every=5, episodes=4)
+    assert judge(rough_cartpole.network, 4) == {}
+    unseen = rough_cartpole.task.episodes(4, "validation", 0)
+    found = adaptation.evaluate(as_actor(rough_cartpole.network), target, rough_cartpole.task, unseen).summary
+    assert judge(rough_cartpole.network, 10) == {"error": found["mean"], "success": found["success"]}

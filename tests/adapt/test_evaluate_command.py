@@ -3,13 +3,16 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from envs import make_dynamics
+from policies.checkpoints import load_policy
 from policies.evaluate import evaluate
+from policies.gradients import gradient_statistics
 from policies.networks import as_actor
 
 ROOT = Path(__file__).parents[2]
@@ -124,3 +127,27 @@ def test_as_a_process_it_ends_the_same(cartpole_file):
     bad = subprocess.run([*start, "none"], cwd=ROOT, capture_output=True, text=True, check=False)
     assert bad.returncode == 2
     assert bad.stderr == "evaluate: policy none: no such file\n"
+
+
+def test_controllers_of_several_horizons_can_fly_the_same_paths(call, quadrotor_file, tmp_path):
+    out, base = tmp_path / "result.json", ("--policy", quadrotor_file, "--episodes", 2)
+    assert call("evaluate", *base, "--episodes-horizon", 15, "--out", out).status == 0
+    policy = load_policy(quadrotor_file)
+    paths = replace(policy.task, horizon=15).episodes(2, "test", 0)
+    wanted = evaluate(as_actor(policy.network), make_dynamics("quadrotor"), policy.task, paths)
+    assert json.loads(out.read_text())["table"]["error"] == wanted.table.error.tolist()
+
+
+def test_paths_that_end_before_the_horizon_are_refused(refused, quadrotor_file):
+    line = refused("evaluate", "--policy", quadrotor_file, "--episodes-horizon", 9)
+    assert "--episodes-horizon 9: expected at least 10, the horizon of the controller" in line
+
+
+def test_the_gradient_is_measured_where_there_is_one(call, refused, cart, rough_cartpole, tmp_path):
+    out = tmp_path / "result.json"
+    assert call("evaluate", *cart, "--episodes", 1, "--gradient", "--out", out).status == 0
+    task, found = rough_cartpole.task, json.loads(out.read_text())
+    episodes = task.episodes(200, "validation", 0)
+    wanted = gradient_statistics(rough_cartpole.network, make_dynamics("cartpole"), task, episodes)
+    assert (found["gradient_norm"], found["gradient_variance"]) == (wanted["norm"], wanted["variance"])
+    assert "--gradient: is that of apg, mpc has none" in refused("evaluate", "--method", "mpc", "--gradient")

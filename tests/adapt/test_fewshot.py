@@ -26,6 +26,7 @@ from policies.networks import as_actor
 
 ROOT = Path(__file__).parents[2]
 FILES = {"config.json", "metrics.json", "policy.safetensors", "residual.safetensors", "transitions.csv"}
+FILES |= {"tuning.csv"}
 LISTED = {
     "system",
     "target",
@@ -479,3 +480,19 @@ def test_a_result_that_should_not_be_overlooked_is_told(source, before, after, s
     notes = report.notes({name: {"success": success, "mean": mean} for name, (success, mean) in pairs})
     assert len(notes) == (said is not None)
     assert all(said in note for note in notes)
+
+
+def test_each_update_of_the_fine_tuning_is_written_and_the_target_is_flown_where_asked(call, cart, tmp_path):
+    import pandas as pd
+
+    assert call("fewshot", *cart, "--watch", 2, "--out", tmp_path / "watched").status == 0
+    watched = pd.read_csv(tmp_path / "watched" / "tuning.csv")
+    assert list(watched["update"]) == [1, 2, 3] and watched.seconds.is_monotonic_increasing
+    assert list(watched.error.notna()) == [False, True, False]
+    assert call("fewshot", *cart, "--out", tmp_path / "plain").status == 0
+    plain = pd.read_csv(tmp_path / "plain" / "tuning.csv")
+    assert "error" not in plain and list(plain.cost) == list(watched.cost)  # to watch changes nothing
+
+
+def test_to_watch_never_is_refused(refused, cart, tmp_path):
+    assert "--watch 0: expected at least 1" in refused("fewshot", *cart, "--watch", 0, "--out", tmp_path / "x")
