@@ -14,7 +14,7 @@ from adapt import command, report
 from envs.errors import InputError
 
 RESULTS = ("config.json", "metrics.json", "policy.safetensors", "residual.safetensors", "transitions.csv", "tuning.csv")
-PICTURES = ("flight.png", "error.png", "residual.png", "training.png", "flight.mp4")
+PICTURES = ("flight.png", "error.png", "residual.png", "training.png", "flight.mp4", "flight.gif")
 DEFAULT_TARGET = ("drag=0.3",)
 LOG_UPDATES = 600
 Repeatable = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
@@ -72,6 +72,8 @@ class Options:
     """Replace what the folder holds."""
     video: bool = False
     """Also write an MP4 of the flight before and after."""
+    gif: bool = False
+    """Also write the same as a GIF, for a web page."""
     device: str = "cpu"
     """Where to compute: cpu, cuda."""
     threads: int = 1
@@ -312,6 +314,10 @@ def _pictures(options, adaptation, folder):
         from adapt.video import write_video
 
         write_video(adaptation, folder / "flight.mp4")
+    if options.gif:
+        from adapt.video import write_video
+
+        write_video(adaptation, folder / "flight.gif", fps=12.5)
 
 
 if __name__ == "__main__":

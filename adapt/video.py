@@ -1,4 +1,4 @@
-"""A film of one flight before and after the adaptation, in real time: an MP4 drawn with OpenCV.
+"""A film of one flight before and after the adaptation, in real time: an MP4 or GIF drawn with OpenCV.
 
 Both flights of the test episode with the median zero-shot error are seen at the same time from the same place, each
 with its trail, the reference, where it should be now, and a close-up that follows the robot.
@@ -16,7 +16,7 @@ from adapt.plots import COLOURS, GREY, LIGHT
 from adapt.report import NAMES
 from envs.dynamics import TORCH
 from envs.errors import InputError
-from policies.files import whole
+from policies.files import replacing, whole
 
 PANEL = (640, 540)  # [pixel] width and height of one flight's picture; half as high where flights stand one on another
 MARGIN = 50  # [pixel] around the scene
@@ -25,6 +25,7 @@ INSET = 180  # [pixel] side of the close-up where there is room for it
 CLOSE = 5.0  # [-] magnification of the close-up
 ROBOT = 0.05  # [-] size of the robot as a share of the scene
 GAP = 12  # [pixel] between close-up and edge
+GIF_WIDTH, GIF_COLOURS = 760, 48  # [pixel], [-]
 FONT = cv2.FONT_HERSHEY_DUPLEX
 
 
@@ -61,7 +62,7 @@ def write_video(adaptation, path, fps=30.0):
     """Film the flight before and after the adaptation; the file is there whole or not at all.
 
     Raises:
-        InputError: `path` doesn't end in .mp4 or can't be written, or `fps` isn't positive.
+        InputError: `path` doesn't end in .mp4 or .gif or can't be written, or `fps` isn't positive.
     """
     if not 0 < fps < float("inf"):
         raise InputError(f"--video {path}: {fps:g} frames per second, expected more than 0")
@@ -69,17 +70,35 @@ def write_video(adaptation, path, fps=30.0):
 
 
 def write_frames(path, film, fps):
-    """Write the pictures (height, width, 3), blue, green, red, that `film()` yields as an MP4.
+    """Write the pictures (height, width, 3), blue, green, red, that `film()` yields as an MP4 or a GIF.
 
     Raises:
-        InputError: `path` doesn't end in .mp4 or can't be written.
+        InputError: `path` doesn't end in .mp4 or .gif, or can't be written.
     """
     path = Path(path)
-    if path.suffix != ".mp4":
-        raise InputError(f"--video {path}: expected a name that ends in .mp4")
+    if path.suffix not in WRITERS:
+        raise InputError(f"--video {path}: expected a name that ends in {' or '.join(WRITERS)}")
     if not path.parent.is_dir():
         raise InputError(f"--video {path}: there is no folder {path.parent}")
-    film = film()
+    WRITERS[path.suffix](path, film(), fps)
+
+
+def _write_gif(path, film, fps):
+    """A looped GIF, small enough for a web page. All pictures share one palette, so that nothing flickers."""
+    from PIL import Image
+
+    images = []
+    for frame in film:
+        share = min(1.0, GIF_WIDTH / frame.shape[1])
+        small = cv2.resize(frame, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
+        images.append(Image.fromarray(cv2.cvtColor(small, cv2.COLOR_BGR2RGB)))
+    palette = images[len(images) // 2].quantize(GIF_COLOURS)
+    first, *rest = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+    with replacing(path) as partial:
+        first.save(partial, "GIF", save_all=True, append_images=rest, duration=round(1000 / fps), loop=0)
+
+
+def _write_mp4(path, film, fps):
     first = next(film)
     with whole(path) as partial:
         writer = cv2.VideoWriter(str(partial), cv2.VideoWriter_fourcc(*"mp4v"), fps, first.shape[1::-1])
@@ -91,6 +110,9 @@ def write_frames(path, film, fps):
                 writer.write(frame)
         finally:
             writer.release()
+
+
+WRITERS = {".mp4": _write_mp4, ".gif": _write_gif}
 
 
 def frames(adaptation, fps):

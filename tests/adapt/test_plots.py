@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
+from PIL import Image
 
 from adapt import plots, video
 from adapt.adaptation import Adaptation, finetune
@@ -243,6 +244,20 @@ def test_the_film_of_every_system_lasts_as_long_as_the_flight(adaptation, tmp_pa
     while film.read()[0]:
         count += 1
     assert count == round(last * task.system.dt * 20) + 1
+
+
+def test_the_same_film_can_be_a_gif_that_goes_on_for_ever(quadrotor, tmp_path):
+    video.write_video(quadrotor, tmp_path / "flight.gif", fps=5)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["flight.gif"]
+    frames = list(video.frames(quadrotor, 5))
+    with Image.open(tmp_path / "flight.gif") as film:
+        assert film.n_frames == len(frames)
+        assert film.info["duration"] == 200 and film.info["loop"] == 0
+        assert film.size[0] == video.GIF_WIDTH and film.size[1] < frames[0].shape[0]
+        film.seek(film.n_frames - 1)
+        shown = np.asarray(film.convert("RGB"))[..., ::-1].astype(float)
+    small = cv2.resize(frames[-1], shown.shape[1::-1], interpolation=cv2.INTER_AREA)
+    assert np.abs(shown - small).mean() < 6  # of 255: few colours, but the right ones
 
 
 def test_the_robot_moves_from_frame_to_frame(quadrotor):
