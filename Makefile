@@ -8,10 +8,11 @@ ARGS ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
+COMMA := ,
 NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
 USABLE := $(shell $(BIN)/python -c 'import pip; $(NEW_ENOUGH)' 2>/dev/null && echo yes)
 
-.PHONY: help fewshot test lint format clean FORCE
+.PHONY: help fewshot test lint format docs clean FORCE
 .DEFAULT_GOAL := help
 
 help: ## list these commands
@@ -32,16 +33,24 @@ format: $(VENV)/.installed-test ## mend style and format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# Warnings of the docstring parser count, too. The variable silences the theme's note on its successor (see mkdocs.yml).
+docs: $(VENV)/.installed-docs ## build the API reference into site/; warnings are errors
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict $(ARGS)
+
 clean: ## remove .venv, builds and caches; runs/ stays
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache
+	rm -rf $(VENV) build dist site *.egg-info .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# The two stamps are newer than pyproject.toml exactly while what it asks for is installed.
+# The stamps are newer than pyproject.toml exactly while what it asks for is installed.
 $(VENV)/.installed: pyproject.toml $(if $(USABLE),,FORCE)
 	$(call install,.,$@)
 
 $(VENV)/.installed-test: pyproject.toml $(if $(USABLE),,FORCE)
 	$(call install,.[test],$@ $(VENV)/.installed)
+
+# With the test tools, so that `make docs` and `make test` in turn install nothing.
+$(VENV)/.installed-docs: pyproject.toml $(if $(USABLE),,FORCE)
+	$(call install,.[test$(COMMA)docs],$@ $(VENV)/.installed-test $(VENV)/.installed)
 
 # $(1) what pip installs, $(2) the stamps that say so. The mark .installing outlives an install that was cut off, and
 # then nothing in .venv is trusted; pip's own refusals (status 1 or 2) leave .venv as it was.
@@ -55,7 +64,7 @@ define install
   echo "Making $(VENV) with $$("$$python" --version)"; \
   "$$python" -m venv --clear $(VENV) || exit; \
 fi
-@rm -f $(VENV)/.installed $(VENV)/.installed-test && touch $(VENV)/.installing
+@rm -f $(VENV)/.installed $(VENV)/.installed-test $(VENV)/.installed-docs && touch $(VENV)/.installing
 @echo "Installing $(1) into $(VENV)"; $(BIN)/python -m pip install --disable-pip-version-check --editable '$(1)' \
   || { status=$$?; [ $$status -gt 2 ] || rm $(VENV)/.installing; exit $$status; }
 @rm $(VENV)/.installing && touch $(2)

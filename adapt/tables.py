@@ -1,151 +1,178 @@
-"""Tables of several runs: `python -m adapt.tables runs/fewshot-* --csv results/fewshot.csv`.
+"""Tables and figures from the committed results: `python -m adapt.tables`, and `--check` to see that they still agree.
 
-Reads the metrics.json of `adapt.fewshot` and `adapt.vision` or the JSON of `adapt.evaluate`, writes one CSV row per
-run, and prints the mean and standard deviation over seeds as Markdown.
+Markdown goes between `<!-- table: table1 -->` and `<!-- end of table -->` in the README, LaTeX (for `booktabs`) to
+`tables/` and pictures to `figures/` in the folder of the results.
 """
 
-import json
-import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
-
-import tyro
+from typing import NamedTuple
 
 from adapt import command
+from adapt.table_layouts import HOW, LAYOUTS
 from envs.errors import InputError
 from policies.files import replacing
 
-# Runs that differ in more than their seed are not averaged.
-GROUP = ("system", "set", "target", "method", "solver", "horizon", "trained_in", "samples", "residual", "updates")
-STAGES = ("source", "zero_shot", "few_shot", "oracle")
+BEGIN, END = re.compile(r"<!-- table: (\S+) -->"), "<!-- end of table -->"
+MEND = "run python -m adapt.tables"
 
 
 @dataclass(frozen=True)
 class Options:
-    """Collect the results of several runs into a CSV and a Markdown table with mean and spread over seeds."""
+    """Write the tables of the README, LaTeX tables and figures from the CSVs of the results."""
 
-    runs: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Folders of adapt.fewshot or adapt.vision, or JSON files of adapt.evaluate."""
-    csv: str | None = None
-    """File for one row per run."""
-    overwrite: bool = False
-    """Replace that file."""
+    check: bool = False
+    """Write nothing; exit status 2 and one line if a table or figure isn't what the results give."""
+    results: str = "results"
+    """Folder with experiments.csv, curves.csv and published.csv."""
+    readme: str = "README.md"
+    """Markdown file whose marked tables are filled."""
 
 
 def main(options):
-    """Read, write the CSV, print the table."""
-    import pandas as pd
+    """Read the evidence, then write or compare."""
+    from adapt import evidence, figures
 
-    _check(options)
-    rows = {run: _rows(Path(run)) for run in options.runs}
-    table = pd.DataFrame([row for part in rows.values() for row in part])
-    keys = [key for key in GROUP if key in table]
-    _refuse_repeated(table[[*keys, "seed"]], [run for run, part in rows.items() for _ in part])
-    table = table.sort_values([*keys, "seed"], ignore_index=True)
-    if options.csv:
-        with replacing(options.csv) as partial:
-            table.to_csv(partial, index=False)
-    print(summary(table, keys).to_markdown(index=False))
-
-
-def _check(options):
-    if not options.runs:
-        raise InputError("no runs: name folders of adapt.fewshot, or JSON files of adapt.evaluate")
-    command.output_file("--csv", options.csv, options.overwrite, "runs.csv")
-
-
-def _refuse_repeated(table, runs):
-    """Two runs of one group and seed are one result, or differ in what the table doesn't show: no spread over seeds."""
-    seen = {}
-    for run, values in zip(runs, table.itertuples(index=False), strict=True):
-        same = tuple(map(str, values))  # text, as a missing value doesn't equal itself
-        if same in seen:
-            raise InputError(f"{seen[same]} and {run}: are of one group and have the same seed; leave one out")
-        seen[same] = run
+    text = _read(options.readme)
+    marks = marked(text, options.readme, LAYOUTS)
+    known = evidence.read(options.results)
+    tables = {name: layout(known) for name, layout in LAYOUTS.items()}
+    latex_files = {Path(options.results) / "tables" / f"{name}.tex": latex(name, t) for name, t in tables.items()}
+    pictures = Path(options.results) / "figures"
+    if options.check:
+        check_readme(options.readme, text, marks, tables)
+        check_files(latex_files)
+        figures.check(known, pictures)
+        print("tables and figures agree with the results")
+        return
+    for path, content in {**latex_files, Path(options.readme): filled(text, marks, tables)}.items():
+        _write(path, content)
+    figures.draw_all(known, pictures)
+    print(
+        f"wrote {len(marks)} tables of {options.readme}, {len(latex_files)} to {options.results}/tables, and {pictures}"
+    )
 
 
-def summary(table, keys):
-    """One line per group of runs that differ in their seed: mean ± standard deviation of the runs' means."""
-    import pandas as pd
-
-    lines = []
-    for group, runs in table.groupby(keys, dropna=False, sort=False):
-        line = dict(zip(keys, group, strict=True)) | {"seeds": len(runs), "unit": runs.unit.iloc[0]}
-        for name in (*STAGES, "error"):
-            if f"{name}_mean" in runs:
-                line[name] = _spread(runs[f"{name}_mean"])
-                line[f"{name} success"] = f"{runs[f'{name}_success'].mean():.3f}"
-        for name in ("few_shot/oracle", "seconds"):
-            if name in runs and runs[name].notna().all():
-                line[name] = _spread(runs[name], 3 if "/" in name else 1)
-        lines.append(line)
-    table = pd.DataFrame(lines).astype(object)
-    return table.where(table.notna(), "")
-
-
-def _spread(values, digits=4):
-    return f"{values.mean():.{digits}f} ± {values.std(ddof=0):.{digits}f}"
-
-
-def _rows(run):
-    path = run / "metrics.json" if run.is_dir() else run
+def _read(path):
     try:
-        metrics = json.loads(path.read_text())
-        if "few_shot" in metrics:
-            return [_fewshot_row(path, metrics)]
-        return _vision_rows(metrics) if "camera" in metrics else [_evaluation_row(metrics)]
-    except OSError as error:
-        raise InputError(f"{path}: can't be read ({error.strerror}); name folders of adapt.fewshot") from None
-    except (ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: holds no results of adapt.fewshot, adapt.vision or adapt.evaluate") from None
+        return Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        told = getattr(error, "strerror", None) or "not UTF-8"
+        raise InputError(f"{path}: can't be read ({told}); name a Markdown file with --readme") from None
 
 
-def _fewshot_row(path, metrics):
-    row = {key: metrics[key] for key in ("system", "target", "samples", "seed", "metric", "unit")}
-    row |= {key: metrics[key] for key in ("set", "updates") if key in metrics}  # older files don't have them
-    row |= {"method": metrics["method"]} if "method" in metrics else {}
-    row |= {"residual": metrics["residual"]["kind"]} if metrics.get("residual") else {}
-    for stage in STAGES:
-        if stage in metrics:
-            row |= _figures(stage, metrics[stage])
-    if "oracle" in metrics:
-        row["few_shot/oracle"] = row["few_shot_mean"] / row["oracle_mean"]
-    own = sum(seconds for name, seconds in metrics["seconds"].items() if name != "oracle")
-    config = json.loads((path.parent / "config.json").read_text())
-    return row | {"seconds": own, "threads": metrics["threads"], "torch": config["torch"], "commit": config["commit"]}
+def _write(path, content):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as partial:
+        partial.write_text(content, encoding="utf-8")
 
 
-def _vision_rows(metrics):
-    """One row, and one for each other attempt of a planner."""
-    same = ("system", "target", "samples", "seed", "metric", "unit", "threads", "torch", "commit")
-    spent = {"seconds": metrics["training"].get("seconds"), "updates": metrics["training"].get("update")}
-    return [
-        {**{key: metrics[key] for key in same}, "method": f"{one['method']} from pictures", **spent}
-        | _figures("error", one)
-        | {key: one[key] for key in ("steps", "median_ms", "p99_ms")}
-        for one in (metrics, *metrics.get("attempts", ()))
-    ]
+# --- Markdown between markers -----------------------------------------------------------------------------------------
 
 
-def _figures(name, summary):
-    """Columns of one evaluation; null in the file is not a number: none succeeded."""
-    values = {key: summary[key] for key in ("mean", "std", "success", "n")}
-    return {f"{name}_{key}": math.nan if value is None else value for key, value in values.items()}
+class Mark(NamedTuple):
+    """A marked table: its name and the lines of its two markers, from 0."""
+
+    name: str
+    begin: int
+    end: int
 
 
-def _evaluation_row(metrics):
-    options, info = metrics["options"], metrics["policy_info"]
-    row = {"system": options["vehicle"] or options["system"], "set": metrics["set"]}
-    row |= {"target": " ".join(options["target"]), "method": metrics["method"], "policy": options["policy"] or ""}
-    row |= {"solver": info.get("solver", "") + (", compiled" if info.get("compile") else "")}
-    row |= {"horizon": metrics["horizon"], "trained_in": info.get("trained_in", info.get("model", ""))}
-    # Runs from scratch that differ in their best update only are of one group; budgets in a target tell runs apart.
-    row |= {"samples": "" if info.get("finetuned") is False else info.get("samples", "")}
-    row |= {"seed": info.get("seed", metrics["seed"])}
-    row |= _figures("error", metrics)
-    keys = ("calls", "failures", "metric", "unit", "median_ms", "p99_ms", "threads", "torch", "commit")
-    return row | {key: metrics.get(key) for key in keys}
+def marked(text, path, names):
+    """The marked tables of a text, in order.
+
+    Raises:
+        InputError: a name that isn't one of `names`, or a marker without its other half; names file and line.
+    """
+    marks, opened = [], None
+    for number, line in enumerate(text.split("\n")):
+        where = f"{path}: line {number + 1}"
+        if match := BEGIN.fullmatch(line.strip()):
+            if opened:
+                raise InputError(f"{where}: a table begins inside another; put {END!r} before it")
+            if match[1] not in names:
+                raise InputError(f"{where}: no table is called {match[1]!r}; expected one of {', '.join(names)}")
+            opened = (match[1], number)
+        elif line.strip() == END:
+            if not opened:
+                raise InputError(f"{where}: a table ends that never began; remove the line")
+            marks.append(Mark(*opened, number))
+            opened = None
+    if opened:
+        raise InputError(f"{path}: line {opened[1] + 1}: table {opened[0]!r} has no end; add {END!r} behind it")
+    return marks
+
+
+def filled(text, marks, tables):
+    """The text with what stands between markers made anew."""
+    lines = text.split("\n")
+    for mark in reversed(marks):
+        lines[mark.begin + 1 : mark.end] = _block(mark, marks, tables)
+    return "\n".join(lines)
+
+
+def check_readme(path, text, marks, tables):
+    """Refuse a marked table that isn't what the results give.
+
+    Raises:
+        InputError: names the first.
+    """
+    lines = text.split("\n")
+    for mark in marks:
+        if lines[mark.begin + 1 : mark.end] != _block(mark, marks, tables):
+            raise InputError(f"{path}: line {mark.begin + 1}: {mark.name} isn't what the results give; {MEND}")
+
+
+def _block(mark, marks, tables):
+    """The lines between the two markers of a table; the first of a text also says how all of them are read."""
+    return markdown(tables[mark.name], explained=mark == marks[0]).split("\n")
+
+
+def check_files(contents):
+    """Refuse a file that isn't there or doesn't hold what it should.
+
+    Raises:
+        InputError: names the first.
+    """
+    for path, content in contents.items():
+        if not path.is_file():
+            raise InputError(f"{path}: isn't there; {MEND}")
+        if path.read_text(encoding="utf-8") != content:
+            raise InputError(f"{path}: isn't what the results give; {MEND}")
+
+
+# --- how tables are written -------------------------------------------------------------------------------------------
+
+
+def markdown(table, explained=True):
+    """A table with its note, and an empty line before and behind."""
+    note = f"{table.note} {HOW}" if explained else table.note
+    return "\n" + _tabulated(table, "pipe") + f"\n\n*{table.title}.* {note}\n"
+
+
+def latex(name, table):
+    """A table as a float with caption and label, for `booktabs`."""
+    body = _symbols(_tabulated(table, "latex_booktabs"))
+    caption = _symbols(re.sub(r"([%&_#$])", r"\\\1", f"{table.title}. {table.note} {HOW}"))
+    lines = [r"% needs \usepackage{booktabs}", r"\begin{table*}[t]", r"\centering", r"\small"]
+    lines += [body, rf"\caption{{{caption}}}", rf"\label{{tab:{name}}}", r"\end{table*}", ""]
+    return "\n".join(lines)
+
+
+def _tabulated(table, form):
+    from tabulate import tabulate
+
+    sides = ("left", *["right"] * (len(table.columns) - 1))
+    return tabulate(table.rows, table.columns, form, disable_numparse=True, colalign=sides)
+
+
+def _symbols(text):
+    """Bold and the few characters beyond ASCII that our tables use, in LaTeX."""
+    text = re.sub(r"\*\*(.+?)\*\*", r"\\textbf{\1}", text)
+    for symbol, command_ in {"±": r"$\pm$", "–": "--", "×": r"$\times$", "≥": r"$\geq$"}.items():
+        text = text.replace(symbol, command_)
+    return text
 
 
 if __name__ == "__main__":

@@ -85,7 +85,8 @@ def random_polynomials(
     Args:
         n: number of curves.
         kind: a name in `RANDOM_SETS`.
-        steps, dt: points in a curve and the time between them [s]. 111: 10 s and a horizon of 10.
+        steps: points in a curve. 111: 10 s and a horizon of 10.
+        dt: time between them [s].
         speed: in (0, 1], plays the same curve slower (velocity times speed, jerk times speed^3), so less of it.
         generator: the only source of randomness; its device is where the curves are made.
         dtype: default torch's default.

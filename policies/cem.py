@@ -101,7 +101,7 @@ class CEM(CEMPlanner):
             std: (B,) standard deviation to start with.
 
         Returns:
-            Plans (B, T, m), and which rows failed (B,): theirs is the plan that was given.
+            Plans (B, T, m), and which rows failed (B,), whose plan is the one that was given.
         """
         std = std[:, None, None].expand_as(mean)
         failed = torch.ones(len(mean), dtype=torch.bool, device=mean.device)

@@ -188,7 +188,8 @@ def fit(network, inputs, outputs, counts, config, generator):
     loss is the paper's: negative log-likelihood, and 0.01 times the width between the bounds of the log-variance.
 
     Args:
-        inputs, outputs: (N, i) and (N, d), outputs not normalised.
+        inputs: (N, i).
+        outputs: (N, d), not normalised.
         counts: (N, E), how often each member's bootstrap sample holds a row; -1 where a row is held out of all.
         config: `FitConfig`.
 

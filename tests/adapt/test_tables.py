@@ -1,146 +1,176 @@
-"""`python -m adapt.tables`: one row per run, one line per group, and one line for whatever can't be told apart."""
+"""`python -m adapt.tables` fills what is marked and nothing else, and `--check` sees whatever has changed since."""
 
-import json
-import math
+import re
+from pathlib import Path
 
 import pandas as pd
 import pytest
 
-SUMMARY = {"mean": 0.1, "std": 0.02, "success": 1.0, "n": 50}
-ENVIRONMENT = {"torch": "2", "commit": "abc"}
+from adapt.table_layouts import LAYOUTS
+from adapt.tables import BEGIN, latex, marked
+
+ROOT = Path(__file__).parents[2]
+ROW = {"seed": 0, "system": "quadrotor", "set": "paper", "target": "", "method": "apg", "horizon": 10, "mode": ""}
+ROW |= {"samples": 1000, "metric": "position error", "unit": "m", "error": 0.1, "std": 0.02, "success": 1.0, "n": 50}
+TEXT = "# Robots\n\nbefore\n<!-- table: table1 -->\nold\n<!-- end of table -->\nbehind\n"
 
 
-def fewshot_run(folder, error=0.1, kind="acceleration", **changes):
-    """A folder with the results that `adapt.fewshot` leaves, as far as the tables read them; None leaves a key out."""
-    metrics = {"system": "quadrotor", "target": "drag=0.3", "samples": 1000, "seed": 0, "metric": "error", "unit": "m"}
-    metrics |= {"set": "paper", "updates": 200, "residual": {"kind": kind}, "threads": 1}
-    metrics |= {"seconds": {"fit": 1.0, "finetune": 2.0, "oracle": 50.0}}
-    metrics |= {"zero_shot": SUMMARY, "few_shot": {**SUMMARY, "mean": error}, **changes}
-    folder.mkdir()
-    kept = {key: value for key, value in metrics.items() if value is not None}
-    (folder / "metrics.json").write_text(json.dumps(kept))
-    (folder / "config.json").write_text(json.dumps(ENVIRONMENT))
-    return folder
+def mark(name):
+    return f"<!-- table: {name} -->\n<!-- end of table -->\n"
 
 
-def evaluation(path, seed, method="apg", **info):
-    """A file as `adapt.evaluate` writes it, as far as the tables read it."""
-    info = {"seed": seed, **info}
-    metrics = {"method": method, "horizon": 10, "seed": 0, "policy_info": info, **SUMMARY}
-    metrics |= {"options": {"vehicle": None, "system": "cartpole", "target": [], "policy": "a"}, "set": "paper"}
-    metrics |= {"metric": "error", "unit": "m", "median_ms": 0.1}
-    path.write_text(json.dumps(metrics | {"p99_ms": 0.2, "threads": 1, **ENVIRONMENT}))
-    return path
+@pytest.fixture
+def project(tmp_path):
+    """Options for results of three seeds and a README with one marked table."""
+    results = tmp_path / "results"
+    results.mkdir()
+    (results / "published.csv").write_bytes((ROOT / "results" / "published.csv").read_bytes())
+    rows = [
+        ROW | {"experiment": "apg-quadrotor", "seed": seed, "error": e} for seed, e in enumerate((0.01, 0.02, 0.06))
+    ]
+    rows += [ROW | {"experiment": "horizon-concurrent-10", "error": 0.5}]
+    pd.DataFrame(rows).to_csv(results / "experiments.csv", index=False)
+    (tmp_path / "README.md").write_text(TEXT)
+    return "--results", results, "--readme", tmp_path / "README.md"
 
 
-def lines(answer):
-    """The rows of the printed table as dictionaries."""
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in answer.out.splitlines()]
-    return [dict(zip(rows[0], row, strict=True)) for row in rows[2:]]
+def test_marked_tables_are_filled_and_the_rest_of_the_text_stays(call, project):
+    readme = project[3]
+    assert call("tables", *project).status == 0
+    text = readme.read_text()
+    assert text.startswith("# Robots\n\nbefore\n<!-- table: table1 -->\n\n| system ")
+    assert text.endswith("\n<!-- end of table -->\nbehind\n")
+    assert "\nold\n" not in text
+    (line,) = [line for line in text.splitlines() if re.match(r"\| quadrotor \[m\] *\| *APG \|", line)]
+    assert [cell.strip() for cell in line.split("|")[3:5]] == ["**0.0300 ± 0.0216**", "0.05 ± 0.01"]
+    assert call("tables", *project).status == 0
+    assert readme.read_text() == text  # a second time changes nothing
 
 
-def test_runs_of_a_group_are_averaged_over_their_seeds(call, tmp_path):
-    runs = [fewshot_run(tmp_path / str(seed), error, seed=seed) for seed, error in enumerate((0.1, 0.2, 0.6))]
-    (line,) = lines(call("tables", *runs, "--csv", tmp_path / "a.csv"))
-    spread = math.sqrt((0.2**2 + 0.1**2 + 0.3**2) / 3)
-    assert line["few_shot"] == f"0.3000 ± {spread:.4f}"
-    assert line["seeds"] == "3"
-    assert line["seconds"] == "3.0 ± 0.0"  # without the oracle
-    assert pd.read_csv(tmp_path / "a.csv").few_shot_mean.tolist() == [0.1, 0.2, 0.6]
+def test_the_first_table_of_a_text_explains_the_cells_of_all(call, project):
+    readme = project[3]
+    readme.write_text("".join(map(mark, LAYOUTS)))
+    call("tables", *project)
+    notes = [line for line in readme.read_text().splitlines() if line.startswith("*Table")]
+    assert ["standard deviation over seeds" in note for note in notes] == [True] + [False] * (len(LAYOUTS) - 1)
 
 
-@pytest.mark.parametrize("change", [{"set": "fast"}, {"updates": 600}, {"kind": "state"}, {"samples": 100}])
-def test_runs_that_differ_in_more_than_their_seed_are_not_averaged(call, tmp_path, change):
-    runs = [fewshot_run(tmp_path / "a", 0.1), fewshot_run(tmp_path / "b", 0.2, **change)]
-    assert {line["few_shot"] for line in lines(call("tables", *runs))} == {"0.1000 ± 0.0000", "0.2000 ± 0.0000"}
-
-
-def test_older_results_without_set_and_updates_are_read(call, tmp_path):
-    runs = [fewshot_run(tmp_path / str(seed), seed=seed, set=None, updates=None) for seed in (0, 1)]
-    (line,) = lines(call("tables", *runs))
-    assert line["seeds"] == "2"
-    newer = fewshot_run(tmp_path / "newer")
-    assert len(lines(call("tables", *runs, newer))) == 2
-
-
-def test_a_run_in_which_none_succeeded_is_shown_as_such(call, tmp_path):
-    nothing = {"mean": None, "std": None, "success": 0.0, "n": 50}
-    (line,) = lines(call("tables", fewshot_run(tmp_path / "a", oracle=nothing)))
-    assert line["oracle"] == "nan ± nan"
-    assert line["oracle success"] == "0"
-
-
-def test_evaluations_and_adaptations_stand_in_one_table(call, tmp_path):
-    runs = [evaluation(tmp_path / f"{seed}.json", seed) for seed in (0, 1)]
-    (line,) = lines(call("tables", *runs))
-    assert line["error"] == "0.1000 ± 0.0000"
-    assert len(lines(call("tables", *runs, fewshot_run(tmp_path / "a")))) == 2
-
-
-def test_methods_and_what_they_were_trained_in_and_with_are_not_averaged(call, tmp_path):
-    ways = [{}, {"method": "ppo"}, {"method": "ppo", "trained_in": "drag=0.3"}, {"method": "ppo", "samples": 1000}]
-    ways += [{"method": "mpc", "solver": "rti", "model": "source"}, {"method": "mpc", "solver": "rti", "compile": True}]
-    runs = [evaluation(tmp_path / f"{i}-{seed}.json", seed, **way) for i, way in enumerate(ways) for seed in (0, 1)]
-    table = lines(call("tables", *runs))
-    assert len(table) == len(ways)
-    assert {line["seeds"] for line in table} == {"2"}
-
-
-def test_two_runs_of_a_group_with_one_seed_are_refused_by_name(refused, tmp_path):
-    runs = [fewshot_run(tmp_path / name, error) for name, error in (("a", 0.1), ("b", 0.2))]
-    line = refused("tables", *runs, "--csv", tmp_path / "a.csv")
-    assert str(runs[0]) in line
-    assert str(runs[1]) in line
-    assert not (tmp_path / "a.csv").exists()
-    older = [fewshot_run(tmp_path / name, set=None) for name in "cd"]
-    assert "same seed" in refused("tables", runs[0], *older)
-
-
-def test_there_must_be_runs(refused):
-    assert "no runs: name folders" in refused("tables")
-
-
-def test_what_holds_no_results_is_refused(refused, tmp_path):
-    (tmp_path / "a.json").write_text("{}")
-    assert "holds no results" in refused("tables", tmp_path / "a.json")
-    assert "can't be read" in refused("tables", tmp_path / "none.json")
-
-
-def test_a_csv_is_written_only_where_it_can_be_and_nothing_is_lost(call, refused, tmp_path):
-    run = fewshot_run(tmp_path / "run")
-    assert "there is no folder" in refused("tables", run, "--csv", tmp_path / "nodir" / "x.csv")
-    assert "is a folder" in refused("tables", run, "--csv", tmp_path)
-    path = tmp_path / "x.csv"
-    path.write_text("mine")
-    assert "exists; name another file or add --overwrite" in refused("tables", run, "--csv", path)
-    assert path.read_text() == "mine"
-    assert call("tables", run, "--csv", path, "--overwrite").status == 0
-    assert len(pd.read_csv(path)) == 1
-
-
-def test_runs_from_pictures_make_a_row_for_each_way_that_was_tried(call, tmp_path):
-    same = {"steps": 250.0, "median_ms": 1.0, "p99_ms": 2.0}
-    metrics = {
-        "system": "cartpole",
-        "target": "source",
-        "samples": 1000,
-        "metric": "speed",
-        "unit": "m/s",
-        "threads": 1,
+def test_latex_tables_and_figures_are_written_for_all(call, project, contents):
+    call("tables", *project)
+    assert {name for name in contents(project[1]) if "/" in name} == {
+        *(f"tables/{name}.tex" for name in LAYOUTS),
+        "figures/horizon.png",  # the only one there are results for
     }
-    metrics |= {"camera": {"height": 48}, **ENVIRONMENT, **SUMMARY, **same}
-    for seed in (0, 1):
-        trained = {"method": "apg", "seed": seed, "training": {"seconds": 9.0, "update": 50}}
-        planned = {"method": "mpc", "seed": seed, "training": {}}
-        planned |= {"attempts": [{"method": "mpc, other", **SUMMARY, **same, "mean": None, "success": 0.0}]}
-        for own in (trained, planned):
-            (tmp_path / f"{own['method']}{seed}").mkdir()
-            (tmp_path / f"{own['method']}{seed}" / "metrics.json").write_text(json.dumps(metrics | own))
-    answer = call("tables", *sorted(tmp_path.iterdir()), "--csv", tmp_path / "vision.csv")
-    assert answer.status == 0, answer.errors
-    table = pd.read_csv(tmp_path / "vision.csv")
-    assert table.method.value_counts().to_dict() == {
-        f"{name} from pictures": 2 for name in ("apg", "mpc", "mpc, other")
-    }
-    assert table.error_mean[table.method.str.contains("other")].isna().all()
-    assert (table.seconds[table.method.str.startswith("apg")] == 9.0).all()
+
+
+def test_a_latex_table_has_as_many_cells_in_each_row_and_nothing_that_latex_stumbles_over(call, project):
+    call("tables", *project)
+    for path in (project[1] / "tables").iterdir():
+        text = path.read_text()
+        assert all(
+            text.count(rule) == 1 for rule in (r"\toprule", r"\midrule", r"\bottomrule", r"\caption{", r"\label{tab:")
+        )
+        rows = [line for line in text.splitlines() if line.endswith(r"\\")]
+        assert len({row.count("&") for row in rows}) == 1
+        assert rows[0].count("&") + 1 == len(re.search(r"\\begin\{tabular\}\{([lr]+)\}", text)[1])
+        body = "\n".join(line for line in text.splitlines() if not line.startswith("%"))
+        assert not re.search(r"(?<!\\)[%_#]", re.sub(r"\\label\{.*\}", "", body))
+        assert not re.search(r"[^\x00-\x7f]|\*\*", body)
+        assert body.count("{") == body.count("}")
+    assert r"\textbf{0.0300 $\pm$ 0.0216}" in (project[1] / "tables" / "table1.tex").read_text()
+
+
+def test_what_agrees_passes_the_check_and_nothing_is_written(call, project, contents):
+    call("tables", *project)
+    folder = project[1].parent
+    before = contents(folder)
+    answer = call("tables", "--check", *project)
+    assert (answer.status, answer.errors) == (0, [])
+    assert contents(folder) == before
+
+
+def test_the_check_fails_before_tables_are_made_and_writes_nothing(refused, project, contents):
+    before = contents(project[1].parent)
+    assert "README.md: line 4: table1 isn't what the results give; run python -m adapt.tables" in refused(
+        "tables", "--check", *project
+    )
+    assert contents(project[1].parent) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "said"),
+    [
+        ("README.md", "0.0300", "0.0290", "README.md: line 4: table1 isn't"),
+        ("README.md", "0.05 ± 0.01", "0.06 ± 0.01", "README.md: line 4: table1 isn't"),
+        ("results/experiments.csv", "0.06", "0.07", "README.md: line 4: table1 isn't"),
+        ("results/published.csv", "0.05,0.01", "0.05,0.02", "README.md: line 4: table1 isn't"),
+        ("results/experiments.csv", "0.5,", "0.4,", "table2.tex: isn't"),
+        ("results/tables/table3.tex", "0.28", "0.29", "table3.tex: isn't"),
+    ],
+)
+def test_the_check_names_the_first_that_disagrees_when_a_number_has_changed(
+    call, refused, project, name, old, new, said
+):
+    call("tables", *project)
+    path = project[1].parent / name
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new, 1))
+    assert said in refused("tables", "--check", *project)
+
+
+def test_the_check_misses_no_file(call, refused, project):
+    call("tables", *project)
+    (project[1] / "figures" / "horizon.png").unlink()
+    assert "horizon.png: isn't there" in refused("tables", "--check", *project)
+    (project[1] / "tables" / "table2.tex").unlink()
+    assert "table2.tex: isn't there" in refused("tables", "--check", *project)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a\n" + mark("table9"), "line 2: no table is called 'table9'; expected one of table1, "),
+        ("<!-- table: table1 -->\n" + mark("table2"), "line 2: a table begins inside another"),
+        ("a\n<!-- end of table -->\n", "line 2: a table ends that never began"),
+        (mark("table1") + "<!-- table: table2 -->\n", "line 3: table 'table2' has no end"),
+    ],
+)
+def test_markers_that_make_no_sense_are_refused_by_line_and_nothing_is_written(refused, project, contents, text, said):
+    project[3].write_text(text)
+    before = contents(project[1].parent)
+    for options in (project, ("--check", *project)):
+        line = refused("tables", *options)
+        assert f"{project[3]}: {said}" in line
+    assert contents(project[1].parent) == before
+
+
+def test_a_text_without_markers_stays_as_it_is(call, project):
+    project[3].write_text("no tables here: `<!-- table: NAME -->`\n")
+    assert call("tables", *project).status == 0
+    assert project[3].read_text() == "no tables here: `<!-- table: NAME -->`\n"
+
+
+def test_what_cannot_be_read_is_refused_by_name(refused, project):
+    results, readme = project[1], project[3]
+    assert "none.md: can't be read (No such file or directory)" in refused(
+        "tables", "--results", results, "--readme", readme.with_name("none.md")
+    )
+    assert "experiments.csv: can't be read" in refused("tables", "--results", readme.parent, "--readme", readme)
+    readme.write_bytes(b"\xff")
+    assert "README.md: can't be read (not UTF-8)" in refused("tables", *project)
+
+
+def test_special_characters_are_escaped_in_captions_and_cells():
+    table = LAYOUTS["table1"].__globals__["Table"]("50 % of a_b & c", ("x", "y"), [["a_b", "**1 %**"]], "50 %")
+    text = latex("t", table)
+    assert r"\caption{50 \% of a\_b \& c. 50 \%" in text
+    assert r"a\_b & \textbf{1 \%} \\" in " ".join(text.split())
+
+
+def test_tables_and_figures_of_the_project_agree_with_its_results(call):
+    text = (ROOT / "README.md").read_text()
+    marks = marked(text, "README.md", LAYOUTS)
+    assert bool(marks) == bool(BEGIN.search(text))
+    if marks or (ROOT / "results" / "experiments.csv").exists():
+        answer = call("tables", "--check", "--results", ROOT / "results", "--readme", ROOT / "README.md")
+        assert (answer.status, answer.errors) == (0, [])
