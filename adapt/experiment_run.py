@@ -6,7 +6,6 @@ behind the last finished step, and training behind its last validation.
 
 import contextlib
 import csv
-import fcntl
 import hashlib
 import json
 import math
@@ -214,8 +213,9 @@ READERS = {"adapt.evaluate": _evaluation, "adapt.fewshot": _adaptation, "adapt.v
 @contextlib.contextmanager
 def _alone(path):
     """Wait until no other process is in the block with this file; the system lets go of it if the process dies."""
-    with path.open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    from filelock import FileLock
+
+    with FileLock(path):
         yield
 
 

@@ -56,16 +56,23 @@ def part(runs, index, of, minutes):
     Args:
         minutes: (name, seed) → how long it takes.
     """
-    chains = {}
-    for name, seed in runs:
-        root = (needed(name) or (name,))[0]
-        chains.setdefault((root, seed), []).append((name, seed))
     load, parts = [0.0] * of, [[] for _ in range(of)]
-    for chain in sorted(chains.values(), key=lambda chain: (-sum(map(minutes, chain)), chain)):
+    chains = [[one for one in runs if one in chain] for chain in _chains(runs)]
+    for chain in sorted(chains, key=lambda chain: (-sum(map(minutes, chain)), chain)):
         least = load.index(min(load))
         load[least] += sum(map(minutes, chain))
         parts[least] += chain
     return parts[index]
+
+
+def _chains(runs):
+    """Sets of runs that need one another or something in common."""
+    chains = []
+    for name, seed in runs:
+        chain = {(name, seed), *((other, seed) for other in needed(name))}
+        linked = [other for other in chains if other & chain]
+        chains = [*(other for other in chains if not other & chain), chain.union(*linked)]
+    return chains
 
 
 def sweep(tasks, root, engine, jobs, finished_one):

@@ -111,7 +111,7 @@ def test_nothing_is_planned_where_all_is_done():
 
 
 def test_the_parts_of_an_array_cover_all_runs_once_and_keep_chains_together():
-    runs = sweep.chosen([name for name in EXPERIMENTS if "drag" in name or "apg" in name], range(3))
+    runs = sweep.chosen([name for name in EXPERIMENTS if "drag" in name or "quadrotor" in name], range(3))
     parts = [sweep.part(runs, index, 4, lambda one: 1.0 + len(one[0]) / 7) for index in range(4)]
     assert sorted(one for part in parts for one in part) == sorted(runs)
     where = {one: index for index, part in enumerate(parts) for one in part}
