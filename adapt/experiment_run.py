@@ -12,7 +12,7 @@ import math
 import os
 import time
 import traceback
-from dataclasses import fields
+from dataclasses import asdict, fields
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
@@ -87,22 +87,27 @@ def config_hash(name):
 def step_hash(name, number):
     """The same of one step of an experiment and of those before it."""
     experiment = EXPERIMENTS[name]
-    said = [[step.command, step.options, *_settings(step)] for step in experiment.steps[: number + 1]]
+    said = [[step.command, step.out, *_settings(step)] for step in experiment.steps[: number + 1]]
     said.append([config_hash(other) for other in experiment.needs])
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def _settings(step):
-    """The robot and the tuned settings that a step falls back on, as text."""
+    """What a step does, as text: its options, the robot, and the tuned settings that it falls back on.
+
+    Options that are off don't count, so that a new one of a command changes no hash.
+    """
     from adapt import pretrain
     from envs import make_system
     from policies import METHODS, pixel_mpc
 
+    given = import_module(step.command).Options(**step.options)
+    yield repr(sorted((k, v) for k, v in asdict(given).items() if v is not None and v is not False and v != ()))
     system = make_system(step.options.get("system", "cartpole"))
-    method = step.options.get("method", "apg") + ("-pixels" if step.options.get("pixels") else "")
     yield repr(system)
+    method = step.options.get("method", "apg") + ("-pixels" if step.options.get("pixels") else "")
     if step.command == "adapt.pretrain":
-        yield repr(pretrain.configuration(pretrain.Options(**_resolved(step, Path(), 0)), system))
+        yield repr(pretrain.configuration(given, system))
     elif step.command == "adapt.fewshot":
         module = METHODS[method].module
         yield repr(module.finetuning(module.PRESETS.get(system.name, module.Config())))

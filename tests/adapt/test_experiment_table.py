@@ -107,6 +107,23 @@ def test_the_hash_changes_with_an_option_and_with_what_is_needed(monkeypatch):
     step_hash.cache_clear()
 
 
+def test_the_hash_changes_with_the_default_of_an_option_but_not_with_a_new_one(monkeypatch):
+    from dataclasses import field, make_dataclass
+
+    from adapt import fewshot
+
+    name, options = "drag-apg-quadrotor-30", fewshot.Options
+    before = config_hash(name)
+    for fields, changes in (
+        ([("brand_new", bool, field(default=False))], False),
+        ([("exploration", float, 0.2)], True),
+    ):
+        monkeypatch.setattr(fewshot, "Options", make_dataclass("Options", fields, bases=(options,), frozen=True))
+        step_hash.cache_clear()
+        assert (config_hash(name) != before) == changes
+    step_hash.cache_clear()
+
+
 def test_the_hash_changes_with_the_tuned_settings(monkeypatch):
     from dataclasses import replace
 
