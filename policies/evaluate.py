@@ -18,7 +18,10 @@ TEST_EPISODES = {"cartpole": 50, "quadrotor": 50, "fixed_wing": 30}  # as many a
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Result of flying N episodes: a table with one row each, and the flown states (N, steps + 1, n)."""
+    """Result of flying N episodes: a table with one row each, and the flown states (N, steps + 1, n).
+
+    Behind the end of an episode, states repeat the last one; actions there led to nothing, or are zero.
+    """
 
     table: pd.DataFrame  # columns episode, error, success
     metric: str
