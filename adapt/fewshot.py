@@ -41,7 +41,8 @@ class Options:
     set: str | None = None
     """Family of episodes (quadrotor: paper, fast, circle, lemniscate, line, hover, or a CSV of waypoints)."""
     residual: str = "acceleration"
-    """Kind of residual: acceleration, or state as in the paper."""
+    """Kind of residual: acceleration, parameters (refit those of the model and add drag and push; finds them in noisy
+    states, too), or state as in the paper."""
     exploration: float = 0.1
     """Standard deviation of noise on the actions flown for data, which span -1 to 1."""
     rounds: int | None = None
@@ -274,7 +275,7 @@ def _metrics(options, policy, adaptation, validation):
         "seed": options.seed,
         **{name: evaluation.summary for name, evaluation in adaptation.evaluations.items()},
         "prediction": adaptation.prediction,
-        "residual": {"kind": fit.kind, "inputs": fit.inputs, "network": fit.network, "warnings": fit.warnings},
+        "residual": _found(fit),
         "seconds": adaptation.seconds,
         "threads": options.threads,
     }
@@ -292,6 +293,13 @@ def _metrics(options, policy, adaptation, validation):
             metrics["validation"]["with context held"] = held
         metrics["validation"]["n"] = len(validation)
     return metrics
+
+
+def _found(fit):
+    """What was learned, for people."""
+    said = {"kind": fit.kind, "inputs": fit.inputs, "network": fit.network, "warnings": fit.warnings}
+    values = {name: {"value": value, "standard_error": error} for name, (value, error) in fit.parameters.items()}
+    return said | ({"parameters": values, "alike": fit.alike} if fit.kind == "parameters" else {})
 
 
 def _recorded_only(options):

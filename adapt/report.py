@@ -32,10 +32,23 @@ def table(metrics):
             errors = {name: table for name, table in metrics[key].items() if name != "n"}
             rows = [(UNITS.get(row, row), *(table[row] for table in errors.values())) for row in errors["model"]]
             parts.append(tabulate(rows, (title, *errors), "simple", floatfmt=".3g"))
+    parts.extend(parameter_table(metrics["residual"]))
     spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in metrics["seconds"].items())
     parts.append(f"seconds ({metrics['threads']} thread{'s' * (metrics['threads'] > 1)}): {spent}")
     parts.extend(f"note: {note}" for note in (*notes(metrics), *metrics["residual"]["warnings"]))
     return "\n\n" + "\n\n".join(parts) + "\n"
+
+
+def parameter_table(residual):
+    """The parameters that were refitted, as a list of one table, or of nothing where there are none."""
+    from tabulate import tabulate
+
+    found = residual.get("parameters") or {}
+    rows = [
+        (name, f"{one['value']:.4g} ± {one['standard_error']:.1g}", ", ".join(residual["alike"].get(name, ())))
+        for name, one in found.items()
+    ]
+    return [tabulate(rows, ("refitted", "value", "these data can't tell it from"), "simple")] if rows else []
 
 
 def notes(metrics):

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from adapt.fit_acceleration import fit_acceleration
+from adapt.fit_parameters import fit_parameters
 from adapt.fit_state import fit_state
 from adapt.prediction import GROUPS, prediction_error
 from adapt.residual_dynamics import SPEED, ResidualConfig
@@ -18,7 +19,7 @@ from adapt.transitions import check
 from envs.errors import InputError
 
 MINIMUM = 10  # transitions; fewer say nothing about what to leave out
-FITS = {"acceleration": fit_acceleration, "state": fit_state}
+FITS = {"acceleration": fit_acceleration, "state": fit_state, "parameters": fit_parameters}
 
 
 @dataclass(frozen=True)
@@ -55,11 +56,16 @@ class FitReport:
     inputs: dict[str, tuple[str, ...]] = field(default_factory=dict)  # of the linear part, by output
     penalty: dict[str, float] = field(default_factory=dict)  # of the ridge, by output
     network: tuple[str, ...] = ()  # outputs where a network stays
+    parameters: dict[str, tuple[float, float]] = field(default_factory=dict)  # fitted value and standard error
+    alike: dict[str, tuple[str, ...]] = field(default_factory=dict)  # parameters that data can't tell from these
     warnings: tuple[str, ...] = ()
 
 
-def fit_residual(transitions, base, kind="acceleration", seed=0, settings=FitSettings()):
+def fit_residual(transitions, base, kind="acceleration", seed=0, settings=FitSettings(), parameters=()):
     """Learn what `base` lacks to explain the transitions.
+
+    Args:
+        parameters: names that kind "parameters" fits; without any it chooses among all, see `candidates`.
 
     Returns:
         the fitted `ResidualDynamics`, whose context is unset if it has any, and a `FitReport`.
@@ -73,7 +79,11 @@ def fit_residual(transitions, base, kind="acceleration", seed=0, settings=FitSet
     generator = torch.Generator().manual_seed(seed)
     data = _in_double(transitions)
     names = transitions.context_names
-    config = ResidualConfig(kind, settings.hidden if settings.network else 0, names, (SPEED, *names))
+    if parameters and kind != "parameters":
+        raise InputError(f"parameters {', '.join(parameters)}: are fitted by kind parameters, not {kind}")
+    hidden = settings.hidden if settings.network and kind != "parameters" else 0
+    shape = ((), ()) if kind == "parameters" else (names, (SPEED, *names))
+    config = ResidualConfig(kind, hidden, *shape, tuple(parameters))
     _check_prediction(base, data)
     train, held = data.split(1 - settings.held_out, generator)  # before the network draws its weights
     residual = make_residual(base, config, generator)

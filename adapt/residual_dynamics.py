@@ -28,6 +28,7 @@ class ResidualConfig:
     hidden: int = 64  # width of the network; 0 is none
     context_names: tuple[str, ...] = ()  # inputs that are neither state nor action, such as the battery voltage
     factors: tuple[str, ...] = (SPEED,)  # the linear part also sees its inputs times each: the speed, or a context
+    parameters: tuple[str, ...] = ()  # of the model that have other values, see `adapt.parameter_residual`
 
 
 class ResidualDynamics(nn.Module, ABC):

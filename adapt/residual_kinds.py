@@ -3,6 +3,7 @@
 from dataclasses import fields, replace
 
 from adapt.acceleration_residual import AccelerationResidual
+from adapt.parameter_residual import ParameterResidual
 from adapt.residual_dynamics import FORMAT, ResidualConfig
 from adapt.state_residual import StateResidual
 from envs import make_system
@@ -10,7 +11,7 @@ from envs.dynamics import Dynamics
 from envs.errors import InputError
 from policies.files import read_safetensors
 
-RESIDUALS = {"acceleration": AccelerationResidual, "state": StateResidual}
+RESIDUALS = {"acceleration": AccelerationResidual, "state": StateResidual, "parameters": ParameterResidual}
 
 
 def make_residual(base, config=ResidualConfig(), generator=None):
@@ -40,8 +41,8 @@ def load_residual(path, base=None):
             f"{path}: can't read a residual ({error.strerror or error}); name a file that exists"
         ) from error
     try:
-        names = {name: tuple(said["config"][name]) for name in ("context_names", "factors")}
-        config = ResidualConfig(**{**said["config"], **names})
+        shape = {name: tuple(value) if isinstance(value, list) else value for name, value in said["config"].items()}
+        config = ResidualConfig(**shape)
         parameters = {k: tuple(v) if isinstance(v, list) else v for k, v in said["parameters"].items()}
         written = Dynamics(replace(make_system(said["system"]), **parameters), **said["dynamics"])
     except (KeyError, TypeError, AttributeError) as error:
