@@ -33,7 +33,7 @@ class AccelerationResidual(ResidualDynamics):
         self.register_buffer("bias", torch.zeros(outputs, dtype=torch.float64))
         self.terms = None
         if self.config.hidden:
-            self.network = Correction(inputs + contexts, outputs, self.config.hidden, generator)
+            self.network = Correction(inputs + contexts, outputs, self.config.hidden, generator, self.config.activation)
 
     def feature_names(self):
         """What each column of `weights` is multiplied with."""

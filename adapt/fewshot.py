@@ -41,8 +41,9 @@ class Options:
     set: str | None = None
     """Family of episodes (quadrotor: paper, fast, circle, lemniscate, line, hover, or a CSV of waypoints)."""
     residual: str = "acceleration"
-    """Kind of residual: acceleration, parameters (refit those of the model and add drag and push; finds them in noisy
-    states, too), or state as in the paper."""
+    """Kind of residual: parameters (refit those of the model and add drag and push; finds them in noisy states, too),
+    linear, features (random Fourier), network, acceleration (linear and network), state as in the paper, or auto,
+    which takes the one that predicts held-out flight best, the simplest of equals."""
     exploration: float = 0.1
     """Standard deviation of noise on the actions flown for data, which span -1 to 1."""
     rounds: int | None = None
@@ -132,11 +133,10 @@ def _check(options):
         raise InputError("--pixels: learns from pictures, which logs and transitions don't hold; leave them out")
     if options.log and (options.target or options.oracle):
         raise InputError("--log: a recorded flight is the target; leave out --target and --oracle")
-    from adapt.residual import MINIMUM
-    from adapt.residual_kinds import RESIDUALS
+    from adapt.residual import AUTO, KINDS, MINIMUM
 
-    if options.residual not in RESIDUALS:
-        raise InputError(f"--residual {options.residual}: expected one of {', '.join(RESIDUALS)}")
+    if options.residual not in (AUTO, *KINDS):
+        raise InputError(f"--residual {options.residual}: expected one of {', '.join((AUTO, *KINDS))}")
     if options.rounds is not None and not 1 <= options.rounds <= max(1, options.samples // MINIMUM):
         least = f"at least {MINIMUM} transitions in each"
         raise InputError(f"--rounds {options.rounds}: expected at least 1, and {least}")
@@ -299,6 +299,11 @@ def _found(fit):
     """What was learned, for people."""
     said = {"kind": fit.kind, "inputs": fit.inputs, "network": fit.network, "warnings": fit.warnings}
     values = {name: {"value": value, "standard_error": error} for name, (value, error) in fit.parameters.items()}
+    said |= (
+        {"tried": {one.kind: one.score if one.shares is not None else one.why for one in fit.tried}}
+        if fit.tried
+        else {}
+    )
     return said | ({"parameters": values, "alike": fit.alike} if fit.kind == "parameters" else {})
 
 

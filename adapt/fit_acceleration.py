@@ -5,10 +5,10 @@ Both explain the push (an acceleration held over a step) that would have led to 
 
 import torch
 
-from adapt.correction import normalise
+from adapt.correction import normalise, solve
 from adapt.correction import train as train_network
 from adapt.prediction import bound, predict, prediction_error
-from adapt.sparse_ridge import blocks, fit_sparse
+from adapt.sparse_ridge import SparseFit, blocks, fit_sparse
 from envs.errors import InputError
 
 NEGLIGIBLE = 1e-4  # [m/s^2, rad/s^2] what no network is trained for
@@ -19,7 +19,7 @@ SETTLED = 1e-6  # change of the weights at which their fit has converged
 def fit_acceleration(residual, data, train, held, settings, generator):
     """Linear part and network on `train`, judged on `held`; then on all data the linear part where no network is."""
     network, residual.network = residual.network, None
-    _fit_linear(residual, train)
+    _fit_linear(residual, train, settings.linear)
     misled = _misled(residual, held)
     residual.weights[misled], residual.bias[misled] = 0.0, 0.0
     stays = torch.zeros(len(residual.bias), dtype=torch.bool)
@@ -29,7 +29,7 @@ def fit_acceleration(residual, data, train, held, settings, generator):
     after = prediction_error(residual, held)
     weights, bias = residual.weights.clone(), residual.bias.clone()
     residual.network = None
-    fit = _fit_linear(residual, data)
+    fit = _fit_linear(residual, data, settings.linear)
     seen = stays | misled  # what the network was trained on, and what is better left alone
     residual.weights[seen], residual.bias[seen] = weights[seen], bias[seen]
     if stays.any():
@@ -60,8 +60,8 @@ def _choice(residual, fit, stays):
 
 
 @torch.no_grad()
-def _fit_linear(residual, data, rounds=8):
-    """Set weights and bias so that the step, not its start, is explained.
+def _fit_linear(residual, data, any_input=True, rounds=8):
+    """Set weights and bias so that the step, not its start, is explained; without `any_input`, none but zero.
 
     A push held over a step answers to the mean of the inputs over it, so outputs are regressed on that mean, along the
     path that the residual of the last round predicts. (The recorded end of the step would carry its measurement noise
@@ -70,6 +70,8 @@ def _fit_linear(residual, data, rounds=8):
     misses nothing that they can express.
     """
     _set_linear(residual, torch.zeros(len(residual.bias), 1 + residual.weights.shape[1], dtype=torch.float64))
+    if not any_input:
+        return SparseFit(_linear(residual), (0.0,) * len(residual.bias), residual.bias)
     seen = bound(residual, data)
     slopes = _push_slopes(seen, data)
     missed = unexplained(seen, data, slopes)
@@ -163,7 +165,10 @@ def _fit_network(residual, network, train, held, settings, generator):
     if not left.any():
         return left
     normalise(network, seen_train, targets)
-    train_network(network, seen_train, targets, seen_held, wanted, left, settings, generator)
+    if network.activation == "cos":
+        solve(network, seen_train, targets, seen_held, wanted, left)
+    else:
+        train_network(network, seen_train, targets, seen_held, wanted, left, settings, generator)
     with torch.no_grad():
         gains = wanted.square() - (wanted - network(seen_held)).square()
     network.size[~(left & _surely_better(gains, wanted.square(), settings.gain))] = 0.0

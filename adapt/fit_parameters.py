@@ -20,6 +20,7 @@ ROUNDS = 8  # Gauss-Newton steps
 SETTLED = 1e-6  # [-] change of all parameters, in their sizes, at which they have converged
 SURE = 4.0  # [-] standard errors that a parameter must differ from its nominal value
 ALIKE = 0.999  # [-] correlation of two parameters' effects beyond which data can't tell them apart
+NOTICEABLE = 1e-3  # [-] change of a parameter, in its size, that is worth a name
 ENOUGH = 5  # transitions for each parameter
 WORTH = 1e-3  # [-] share of what is left that a parameter must explain
 EXPLAINED = 10 * NEGLIGIBLE  # [m/s^2, rad/s^2] what may be left where states are exact
@@ -92,7 +93,17 @@ def _chosen(loss):
         if tried is None or abs(tried.values[best] - nominal(system, best)) < SURE * tried.errors[best]:
             break
         found = replace(tried, alike=found.alike | {best: _alike(best, names, others)})
-    return found
+    return _without_idle(loss, found)
+
+
+def _without_idle(loss, found):
+    """The same without parameters that a later one has brought back to their nominal value."""
+    system = loss.base.system
+    moved = [n for n, value in found.values.items() if abs(value - nominal(system, n)) > NOTICEABLE * size(system, n)]
+    if len(moved) == len(found.values):
+        return found
+    again = settle(loss, tuple(moved), found.values)
+    return found if again is None else replace(again, alike={name: found.alike[name] for name in moved})
 
 
 def _named(loss, named):

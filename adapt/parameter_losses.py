@@ -10,20 +10,18 @@ initial state that is estimated along with the parameters (Bock's multiple shoot
 model in Ljung 1999, ch. 5), so that noise is averaged over the stretch and enters no input.
 """
 
-from itertools import pairwise
-
 import torch
 
 from adapt.parameter_residual import changed, nominal
 from adapt.prediction import predict
 from adapt.sparse_ridge import blocks
+from adapt.stretches import cut, difference, displaced
 from envs.errors import InputError
 
 STEP = 1e-4  # [-] of a parameter's size, or of a state, for central differences
 SIZE = 0.1  # smallest size that a parameter is taken to have, in its own unit
 NEGLIGIBLE = 1e-4  # [m/s^2, rad/s^2] what needs no explanation
 LENGTH = 10  # control periods of a stretch
-SHORTEST = 3
 SETTLING = 10  # most Gauss-Newton steps of the initial states after a change of the parameters
 SETTLED = 1e-3  # [-] change of the estimated noise at which they have settled
 FLOOR = 1e-6  # [m, m/s, rad, rad/s] smallest noise that a state is taken to have
@@ -79,41 +77,34 @@ class Shooting:
 
     def __init__(self, base, data):
         self.base = base
-        self.measured, self.action, trajectory = stretches(data)
-        self.start = self.measured[:, 0]
+        self.flown = cut(data, LENGTH)
+        self.start = self.flown.measured[:, 0]
         self.noise = None  # (d,) of the measured states, in the tangent space
-        self.folds = blocks(trajectory)
+        self.folds = blocks(self.flown.trajectory)
 
     @torch.no_grad()
     def linearised(self, values, names):
         """See `OneStep`; the initial states are estimated anew for the given values."""
         dynamics = changed(self.base, values)
         for _ in range(SETTLING):
-            left, inner = self._missed(dynamics, self.start), self._inner(dynamics)
+            left, inner = self.flown.missed(dynamics, self.start), self._inner(dynamics)
             if self._estimate_noise(left):
                 break
             change = torch.linalg.lstsq(
                 inner / self._scale(left), (left / self.noise).flatten(1).unsqueeze(-1)
             ).solution
-            self.start = _displaced(self.base.system, self.start, change.squeeze(-1))
+            self.start = displaced(self.base.system, self.start, change.squeeze(-1))
         basis, _ = torch.linalg.qr(inner / self._scale(left))
-        effects = [-central(lambda d: self._missed(d, self.start), self.base, values, name) for name in names]
+        effects = [-central(lambda d: self.flown.missed(d, self.start), self.base, values, name) for name in names]
         rest = [self._apart(part, basis) for part in (left, *effects)]
         return rest[0].flatten(), _columns([part.flatten() for part in rest[1:]], rest[0].numel())
 
-    def _missed(self, dynamics, start):
-        """What leads (M, T + 1, d) from predicted to measured states, in the tangent space; starts may be (…, M, n)."""
-        predicted = [start]
-        for action in self.action.unbind(1):
-            predicted.append(dynamics(predicted[-1], action.expand(*start.shape[:-1], -1)))
-        return _difference(self.base.system, torch.stack(predicted, -2), self.measured)
-
     def _inner(self, dynamics):
         """The effects (M, (T + 1) d, d) of the initial states: central differences, all directions in one batch."""
-        dimensions = len(_difference(self.base.system, self.start[:1], self.start[:1])[0])
+        dimensions = len(difference(self.base.system, self.start[:1], self.start[:1])[0])
         steps = STEP * torch.eye(dimensions, dtype=self.start.dtype)
-        ends = [_displaced(self.base.system, self.start, sign * steps[:, None]) for sign in (1, -1)]
-        ahead, behind = (self._missed(dynamics, end) for end in ends)  # (d, M, T + 1, d)
+        ends = [displaced(self.base.system, self.start, sign * steps[:, None]) for sign in (1, -1)]
+        ahead, behind = (self.flown.missed(dynamics, end) for end in ends)  # (d, M, T + 1, d)
         return -((ahead - behind) / (2 * STEP)).flatten(2).permute(1, 2, 0)
 
     def _estimate_noise(self, left):
@@ -130,48 +121,5 @@ class Shooting:
         return (flat - basis @ (basis.mT @ flat)).squeeze(-1)
 
 
-def stretches(data):
-    """Measured states (M, T + 1, n), actions (M, T, m) and flight (M,) of stretches that flights are cut into.
-
-    The last stretch of a flight overlaps the one before it, so that nothing is left out.
-
-    Raises:
-        ValueError: no flight is as long as the shortest stretch.
-    """
-    chains = _chains(data)
-    length = min(LENGTH, max((last - first for first, last in chains), default=0))
-    if length < SHORTEST:
-        raise ValueError(f"flights of {length} transitions without a gap, expected {SHORTEST}")
-    starts = [
-        min(start, last - length)
-        for first, last in chains
-        if last - first >= length
-        for start in range(first, last, length)
-    ]
-    rows = torch.tensor(starts)[:, None] + torch.arange(length)
-    measured = torch.cat((data.state[rows], data.next_state[rows[:, -1:]]), 1)
-    return measured, data.action[rows], data.trajectory[rows[:, 0]]
-
-
-def _chains(data):
-    """(first, last + 1) of rows that each begin where the one before ended."""
-    follows = (data.next_state[:-1] == data.state[1:]).all(-1) & (data.trajectory[:-1] == data.trajectory[1:])
-    breaks = [0, *((~follows).nonzero()[:, 0] + 1).tolist(), len(data)]
-    return list(pairwise(breaks))
-
-
 def _columns(parts, rows):
     return torch.stack(parts, -1) if parts else torch.zeros(rows, 0, dtype=torch.float64)
-
-
-def _difference(system, states, others):
-    """What leads from states to others (..., n), as (..., d)."""
-    x, y = (system.State(*part.unbind(-1)) for part in torch.broadcast_tensors(states, others))
-    return torch.stack(system.difference(x, y), -1)
-
-
-def _displaced(system, states, deltas):
-    """The states (..., n) that deltas (..., d) lead to."""
-    shape = torch.broadcast_shapes(states.shape[:-1], deltas.shape[:-1])
-    x = system.State(*states.expand(*shape, -1).unbind(-1))
-    return torch.stack(tuple(system.displaced(x, deltas.expand(*shape, -1).unbind(-1))), -1)

@@ -5,10 +5,13 @@ network that learns what the linear part leaves and stays only where it improves
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import torch
 
+from adapt.choose_residual import Tried, choose
 from adapt.fit_acceleration import fit_acceleration
 from adapt.fit_parameters import fit_parameters
 from adapt.fit_state import fit_state
@@ -19,13 +22,37 @@ from adapt.transitions import check
 from envs.errors import InputError
 
 MINIMUM = 10  # transitions; fewer say nothing about what to leave out
-FITS = {"acceleration": fit_acceleration, "state": fit_state, "parameters": fit_parameters}
+FEATURES = 200  # random Fourier features
+
+
+class Kind(NamedTuple):
+    """What `--residual` may name: the form of what is fitted, how, and of which parts it consists."""
+
+    form: str
+    fit: Callable
+    linear: bool = False
+    network: str = ""  # its activation; none where empty
+
+
+# From the simplest to what may take any shape: of two that predict as well, the first is taken.
+KINDS = {
+    "parameters": Kind("parameters", fit_parameters),
+    "linear": Kind("acceleration", fit_acceleration, linear=True),
+    "features": Kind("acceleration", fit_acceleration, network="cos"),
+    "network": Kind("acceleration", fit_acceleration, network="tanh"),
+    "linear+network": Kind("acceleration", fit_acceleration, linear=True, network="tanh"),
+    "state": Kind("state", fit_state, network="tanh"),
+}
+MENU = tuple(KINDS)  # that "auto" chooses from
+KINDS["acceleration"] = KINDS["linear+network"]  # its older name
+AUTO = "auto"
 
 
 @dataclass(frozen=True)
 class FitSettings:
     """How a residual is fitted."""
 
+    linear: bool = True
     network: bool = True
     hidden: int = 64  # width of the network
     held_out: float = 0.2  # share of the trajectories that validates
@@ -58,6 +85,7 @@ class FitReport:
     network: tuple[str, ...] = ()  # outputs where a network stays
     parameters: dict[str, tuple[float, float]] = field(default_factory=dict)  # fitted value and standard error
     alike: dict[str, tuple[str, ...]] = field(default_factory=dict)  # parameters that data can't tell from these
+    tried: tuple[Tried, ...] = ()  # what "auto" chose from
     warnings: tuple[str, ...] = ()
 
 
@@ -65,6 +93,7 @@ def fit_residual(transitions, base, kind="acceleration", seed=0, settings=FitSet
     """Learn what `base` lacks to explain the transitions.
 
     Args:
+        kind: one of `KINDS`, or "auto", which chooses by the flight that each predicts, see `choose_residual`.
         parameters: names that kind "parameters" fits; without any it chooses among all, see `candidates`.
 
     Returns:
@@ -78,16 +107,15 @@ def fit_residual(transitions, base, kind="acceleration", seed=0, settings=FitSet
     check(transitions, base.system, MINIMUM)
     generator = torch.Generator().manual_seed(seed)
     data = _in_double(transitions)
-    names = transitions.context_names
-    if parameters and kind != "parameters":
-        raise InputError(f"parameters {', '.join(parameters)}: are fitted by kind parameters, not {kind}")
-    hidden = settings.hidden if settings.network and kind != "parameters" else 0
-    shape = ((), ()) if kind == "parameters" else (names, (SPEED, *names))
-    config = ResidualConfig(kind, hidden, *shape, tuple(parameters))
+    if kind == AUTO:
+        return _chosen(data, base, seed, settings, began)
+    chosen = _kind(kind, parameters)
+    settings = replace(settings, linear=chosen.linear, network=settings.network and bool(chosen.network))
+    config = _shape(chosen, settings, transitions.context_names, parameters)
     _check_prediction(base, data)
     train, held = data.split(1 - settings.held_out, generator)  # before the network draws its weights
     residual = make_residual(base, config, generator)
-    choice, after = FITS[kind](residual, data, train, held, settings, generator)
+    choice, after = chosen.fit(residual, data, train, held, settings, generator)
     before = prediction_error(base, held)
     report = FitReport(
         kind=kind,
@@ -101,6 +129,30 @@ def fit_residual(transitions, base, kind="acceleration", seed=0, settings=FitSet
         **choice,
     )
     return residual, report
+
+
+def _chosen(data, base, seed, settings, began):
+    """The kind that predicts best, fitted to all data; its report says what was tried."""
+    _check_prediction(base, data)
+    tried, kind = choose(data, base, MENU, lambda part, kind: fit_residual(part, base, kind, seed, settings)[0])
+    residual, report = fit_residual(data, base, kind, seed, settings)
+    return residual, replace(report, tried=tried, seconds=time.perf_counter() - began)
+
+
+def _kind(name, parameters):
+    if name not in KINDS:
+        raise InputError(f"--residual {name}: expected one of {', '.join((AUTO, *KINDS))}")
+    if parameters and KINDS[name].form != "parameters":
+        raise InputError(f"parameters {', '.join(parameters)}: are fitted by kind parameters, not {name}")
+    return KINDS[name]
+
+
+def _shape(kind, settings, contexts, parameters):
+    """The shape of an unfitted residual."""
+    if kind.form == "parameters":
+        return ResidualConfig("parameters", 0, parameters=tuple(parameters), factors=())
+    hidden = (FEATURES if kind.network == "cos" else settings.hidden) if settings.network else 0
+    return ResidualConfig(kind.form, hidden, kind.network or "tanh", contexts, (SPEED, *contexts))
 
 
 def _in_double(transitions):

@@ -26,6 +26,7 @@ class ResidualConfig:
 
     kind: str = "acceleration"
     hidden: int = 64  # width of the network; 0 is none
+    activation: str = "tanh"  # of the network, see `Correction`
     context_names: tuple[str, ...] = ()  # inputs that are neither state nor action, such as the battery voltage
     factors: tuple[str, ...] = (SPEED,)  # the linear part also sees its inputs times each: the speed, or a context
     parameters: tuple[str, ...] = ()  # of the model that have other values, see `adapt.parameter_residual`

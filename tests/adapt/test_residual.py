@@ -403,7 +403,7 @@ def test_transitions_that_cannot_teach_are_refused():
     ):
         with pytest.raises(InputError, match=message):
             fit_residual(wrong, source)
-    with pytest.raises(InputError, match="--residual magic: expected one of acceleration, state"):
+    with pytest.raises(InputError, match="--residual magic: expected one of auto, parameters, linear"):
         fit_residual(data, source, "magic")
 
 

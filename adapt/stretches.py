@@ -1,0 +1,75 @@
+"""Stretches of recorded flight, and how far dynamics stray from them when they are left to themselves."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+
+SHORTEST = 3  # control periods
+
+
+@dataclass(frozen=True)
+class Stretches:
+    """M stretches of T control periods without a gap."""
+
+    measured: torch.Tensor  # (M, T + 1, n) states
+    action: torch.Tensor  # (M, T, m)
+    trajectory: torch.Tensor  # (M,) flight that each is of
+    context: torch.Tensor | None = None  # (M, c) at its beginning
+
+    def seen_by(self, dynamics):
+        """The dynamics with the context that each stretch begins with, if they take any."""
+        names = getattr(getattr(dynamics, "config", None), "context_names", ())
+        return dynamics.with_context(self.context) if names else dynamics
+
+    def missed(self, dynamics, start):
+        """What leads (…, M, T + 1, d) from predicted to measured states, in the tangent space.
+
+        Args:
+            start: (…, M, n) that predictions begin in.
+        """
+        predicted = [start]
+        for action in self.action.unbind(1):
+            predicted.append(dynamics(predicted[-1], action.expand(*start.shape[:-1], -1)))
+        return difference(dynamics.system, torch.stack(predicted, -2), self.measured)
+
+
+def cut(data, length):
+    """Flights cut into stretches of `length` control periods, or of the longest that there is.
+
+    The last stretch of a flight overlaps the one before it, so that nothing is left out.
+
+    Raises:
+        ValueError: no flight is as long as the shortest stretch.
+    """
+    chains = _chains(data)
+    length = min(length, max((last - first for first, last in chains), default=0))
+    if length < SHORTEST:
+        raise ValueError(f"flights of {length} transitions without a gap, expected {SHORTEST}")
+    long = [(first, last) for first, last in chains if last - first >= length]
+    starts = [min(start, last - length) for first, last in long for start in range(first, last, length)]
+    rows = torch.tensor(starts)[:, None] + torch.arange(length)
+    first = rows[:, 0]
+    measured = torch.cat((data.state[rows], data.next_state[rows[:, -1:]]), 1)
+    context = None if data.context is None else data.context[first]
+    return Stretches(measured, data.action[rows], data.trajectory[first], context)
+
+
+def _chains(data):
+    """(first, last + 1) of rows that each begin where the one before ended."""
+    follows = (data.next_state[:-1] == data.state[1:]).all(-1) & (data.trajectory[:-1] == data.trajectory[1:])
+    breaks = [0, *((~follows).nonzero()[:, 0] + 1).tolist(), len(data)]
+    return list(pairwise(breaks))
+
+
+def difference(system, states, others):
+    """What leads from states to others (..., n), as (..., d)."""
+    x, y = (system.State(*part.unbind(-1)) for part in torch.broadcast_tensors(states, others))
+    return torch.stack(system.difference(x, y), -1)
+
+
+def displaced(system, states, deltas):
+    """The states (..., n) that deltas (..., d) lead to."""
+    shape = torch.broadcast_shapes(states.shape[:-1], deltas.shape[:-1])
+    x = system.State(*states.expand(*shape, -1).unbind(-1))
+    return torch.stack(tuple(system.displaced(x, deltas.expand(*shape, -1).unbind(-1))), -1)

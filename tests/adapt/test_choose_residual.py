@@ -1,0 +1,97 @@
+"""The kind of residual is chosen by the flight that it predicts, the simplest of equals."""
+
+import pytest
+import torch
+
+from adapt import collect
+from adapt.choose_residual import Tried, choose, left_over, simplest
+from adapt.residual import MENU, fit_residual
+from envs import make_dynamics
+from envs.errors import InputError
+from policies.checkpoints import load_policy
+
+TARGET = "drag=0.3"
+
+
+@pytest.fixture(scope="module")
+def data():
+    policy = load_policy("quadrotor")
+    task = policy.task
+    return collect(policy.actor(), (make_dynamics("quadrotor", TARGET), task, task.episodes(20, "train", 9)), 250, 0.1)
+
+
+def tried(kind, *shares):
+    return Tried(kind, torch.tensor(shares))
+
+
+def test_the_model_leaves_everything_and_the_truth_nothing(data):
+    base, truth = make_dynamics("quadrotor"), make_dynamics("quadrotor", TARGET)
+    half = make_dynamics("quadrotor", "drag=0.15")
+    all_of_it, none, a_quarter = (float(left_over(one, base, fit_double(data)).mean()) for one in (base, truth, half))
+    assert all_of_it == pytest.approx(1.0, abs=0.5)
+    assert none < 1e-6
+    assert a_quarter == pytest.approx(all_of_it / 4, rel=0.1)
+
+
+def fit_double(data):
+    from adapt.residual import _in_double
+
+    return _in_double(data)
+
+
+def test_of_equals_the_simplest_is_taken():
+    assert simplest([tried("a", 0.5, 0.6, 0.4), tried("b", 0.49, 0.6, 0.4)]) == "a"
+
+
+def test_a_kind_that_is_surely_better_is_taken():
+    assert simplest([tried("a", 0.5, 0.6, 0.4), tried("b", 0.1, 0.2, 0.1), tried("c", 0.1, 0.19, 0.1)]) == "b"
+
+
+def test_a_doubtful_gain_is_not_worth_a_more_complex_kind():
+    assert simplest([tried("a", 0.5, 0.5, 0.5, 0.5), tried("b", 0.1, 0.9, 0.1, 0.8)]) == "a"
+
+
+def test_what_could_not_be_fitted_is_left_out_and_where_nothing_could_that_is_said():
+    failed = Tried("a", None, "too few")
+    assert simplest([failed, tried("b", 0.5)]) == "b"
+    with pytest.raises(InputError, match="no kind of residual can be fitted; a: too few"):
+        simplest([failed])
+
+
+def test_nothing_more_complex_is_tried_once_nothing_is_left(data):
+    asked = []
+
+    def fit(part, kind):
+        asked.append((kind, len(part)))
+        return make_dynamics("quadrotor", {"poor": "drag=0.1", "perfect": TARGET, "never": TARGET}[kind])
+
+    found, kind = choose(fit_double(data), make_dynamics("quadrotor"), ("poor", "perfect", "never"), fit)
+    assert kind == "perfect"
+    assert [one.kind for one in found] == ["poor", "perfect"]
+    assert {name for name, _ in asked} == {"poor", "perfect"}
+    assert all(count < 250 for _, count in asked)  # never on what it is judged by
+
+
+def test_a_kind_that_there_are_too_few_transitions_for_is_dropped(data):
+    def fit(part, kind):
+        if kind == "hungry":
+            raise InputError("too few transitions")
+        return make_dynamics("quadrotor", "drag=0.1")
+
+    found, kind = choose(fit_double(data), make_dynamics("quadrotor"), ("hungry", "modest"), fit)
+    assert kind == "modest" and found[0].why == "too few transitions"
+
+
+def test_auto_finds_a_drag_and_says_what_it_tried(data):
+    _, report = fit_residual(data, make_dynamics("quadrotor"), "auto")
+    assert report.kind == "parameters" and report.parameters["drag"][0] == pytest.approx(0.3, rel=1e-5)
+    assert [one.kind for one in report.tried] == ["parameters"]
+    assert report.tried[0].score < 1e-3
+
+
+@pytest.mark.parametrize("kind", MENU)
+def test_every_kind_of_the_menu_predicts_better_than_the_model(data, kind):
+    _, report = fit_residual(data, make_dynamics("quadrotor"), kind)
+    share = {"state": 1.0, "network": 0.6, "features": 0.6}.get(kind, 1e-3)
+    assert report.after["acceleration"] < share * report.before["acceleration"]
+    assert report.kind == kind
