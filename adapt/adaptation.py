@@ -177,10 +177,12 @@ def adapt(
     # A copy: what is returned stays on the CPU, where the transitions are.
     learned = copy.deepcopy(residual if context is None else residual.with_context(context)).to(device)
     truth = target if target is not None else learned
-    judge = watch and Judge(policy, truth, seen, watch)
+    judge = watch and Judge(policy, truth, seen, watch, (config or finetuning(policy)).updates)
     clock.next("finetune")
     tuned, history = finetune(begun, learned, config, seed, progress, footage, judge)
     keep("policy", tuned)
+    if judge:
+        clock.move("finetune", "watch", judge.seconds)
     clock.next("evaluate")
     evaluations["zero_shot"] = evaluate(actor, truth, seen, tests)
     evaluations["few_shot"] = evaluate(tuned.actor(seed), truth, seen, tests)
@@ -219,19 +221,21 @@ def _flown(policy, target, task, samples, exploration, seed, device):
 
 
 class Judge:
-    """Flies a network over validation episodes every so many updates."""
+    """Flies a network over validation episodes every so many updates, and after the last; counts its `seconds`."""
 
-    def __init__(self, policy, dynamics, task, every, episodes=50):
-        self.policy, self.dynamics, self.task, self.every = policy, dynamics, task, every
-        self.episodes = test_episodes(task, episodes, "validation")
+    def __init__(self, policy, dynamics, task, every, last, episodes=50):
+        self.policy, self.dynamics, self.task, self.every, self.last = policy, dynamics, task, every, last
+        self.episodes, self.seconds = test_episodes(task, episodes, "validation"), 0.0
 
     def __call__(self, network, update):
         """`error` and `success`, or nothing after the updates between."""
-        if update % self.every:
+        if update % self.every and update != self.last:
             return {}
+        begun = time.perf_counter()
         device = next(network.parameters()).device
         actor = replace(self.policy, network=network).actor()
         summary = evaluate(actor, self.dynamics, self.task, self.episodes.to(device)).summary
+        self.seconds += time.perf_counter() - begun
         return {"error": summary["mean"], "success": summary["success"]}
 
 
@@ -246,6 +250,12 @@ class Clock:
         self.stop()
         self.name, self.begun = name, time.perf_counter()
         self.stage(name)
+
+    def move(self, stage, other, seconds):
+        """Count a part of a stage, which ends, as another one."""
+        self.stop()
+        self.seconds[stage] -= seconds
+        self.seconds[other] = self.seconds.get(other, 0.0) + seconds
 
     def stop(self):
         """End the present stage; returns {stage: seconds}."""

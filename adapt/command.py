@@ -179,9 +179,9 @@ def pick_policy(path, system, vehicle, method="apg"):
 
 @contextlib.contextmanager
 def interrupts_noted():
-    """Put Ctrl-C off to where a run is whole: yields a function that says whether one came.
+    """Put Ctrl-C and SIGTERM off to where a run is whole: yields a function that says whether one came.
 
-    A second Ctrl-C ends the run where it is.
+    A second one ends the run where it is.
     """
     came = []
 
@@ -190,11 +190,12 @@ def interrupts_noted():
             raise KeyboardInterrupt
         came.append(number)
 
-    before = signal.signal(signal.SIGINT, note)
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield lambda: bool(came)
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager
@@ -256,7 +257,8 @@ def environment(seed, threads):
     import subprocess
     from importlib.metadata import version
 
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    # The hash alone, even on a tag; "-dirty" where files differ from the commit.
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude", "*"]
     commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
     packages = {name: version(name) for name in ("torch", "torchrl", "tensordict", "casadi")}
     return {"seed": seed, "threads": threads, "python": platform.python_version(), **packages, "commit": commit}

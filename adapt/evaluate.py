@@ -110,7 +110,7 @@ def check(options):
 
 def _episodes_horizon(options, task):
     """The horizon to draw episodes for, at least that of the controller: its references must not end before it does."""
-    horizon = options.episodes_horizon or task.horizon
+    horizon = task.horizon if options.episodes_horizon is None else options.episodes_horizon
     if horizon < task.horizon:
         raise InputError(
             f"--episodes-horizon {horizon}: expected at least {task.horizon}, the horizon of the controller"

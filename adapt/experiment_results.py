@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from adapt.experiment_run import CURVE, VERSIONS, config_hash, curve, finished, place
+from adapt import command
+from adapt.experiment_run import CURVE, VERSIONS, config_hash, curve, finished
 from adapt.experiment_table import EXPERIMENTS
 from envs.errors import InputError
 from policies.files import replacing
@@ -12,6 +13,7 @@ FIGURES += ("median_ms", "p99_ms", "gradient_norm", "gradient_variance", "second
 COLUMNS = ("experiment", "seed", "system", "set", "target", "method", "horizon", "mode", "samples", "metric", "unit")
 COLUMNS += (*FIGURES, "threads", *VERSIONS, "commit", "config")
 KEY = ["experiment", "seed"]
+POINTS = (*KEY, *CURVE)
 
 
 def read(folder, name="experiments.csv", columns=COLUMNS):
@@ -31,6 +33,12 @@ def read(folder, name="experiments.csv", columns=COLUMNS):
         raise InputError(f"{path}: can't be read ({str(error).splitlines()[0]})") from None
     if missing := [column for column in columns if column not in table]:
         raise InputError(f"{path}: has no column {missing[0]}; expected what adapt.experiments writes")
+    numbers = pd.to_numeric(table.seed, errors="coerce")
+    if (wrong := numbers.isna() | (numbers < 0) | (numbers % 1 != 0)).any():
+        line = int(wrong.to_numpy().argmax()) + 2
+        raise InputError(
+            f"{path}: line {line}: seed is {table.seed.iloc[line - 2]!r}, expected an integer of at least 0"
+        )
     if unknown := sorted(set(table.experiment) - set(EXPERIMENTS)):
         raise InputError(f"{path}: names {unknown[0]}, which is no experiment; remove its rows")
     return table
@@ -55,6 +63,9 @@ class Results:
     def __init__(self, folder, runs=None):
         self.folder, self.keeps = Path(folder), runs is not None
         self.table = read(folder)
+        if self.keeps:  # told before hours are spent
+            read(folder, "curves.csv", POINTS)
+            command.output_folder(folder, overwrite=True)
         self.hashes = {(row.experiment, int(row.seed)): row.config for row in self.table.itertuples()}
 
     def minutes(self, name):
@@ -68,15 +79,10 @@ class Results:
         return "done" if self.hashes[run] == config_hash(run[0]) else "old"
 
     def done(self, runs):
-        """A function that says whether a run is done: in the table, or in the folder of the runs if rows stay there."""
+        """A function that says whether a run is done: in the table or, if rows stay with the runs, there."""
 
-        def is_done(run):
-            if self.keeps:
-                return self.state(run) == "done"
-            row = finished(runs, *run)
-            return row is not None and row["config"] == config_hash(run[0])
-
-        return is_done
+        outputs = self.outputs(runs)
+        return lambda run: self.state(run) == "done" or (not self.keeps and outputs(run))
 
     def outputs(self, runs):
         """A function that says whether what others need of a run is there, made with the present settings."""
@@ -95,10 +101,12 @@ class Results:
         """Add the rows and curves of finished runs to the tables; a row that is there is replaced."""
         if not self.keeps:
             return
+        from filelock import FileLock
+
         rows = [finished(runs, *one) for one in those]
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self.table = self._write("experiments.csv", COLUMNS, rows)
-        self._write("curves.csv", (*KEY, *CURVE), [point for one in those for point in curve(runs, *one)])
+        with FileLock(self.folder / ".lock"):  # other sweeps may add to the same tables
+            self.table = self._write("experiments.csv", COLUMNS, rows)
+            self._write("curves.csv", POINTS, [point for one in those for point in curve(runs, *one)])
 
     def _write(self, name, columns, rows):
         import pandas as pd
@@ -119,18 +127,19 @@ class Results:
 
     def gather(self, runs):
         """Add all finished runs of a folder that the table doesn't hold; returns how many."""
-        found = [(path.parent.parent.name, int(path.parent.name.removeprefix("seed-"))) for path in _rows(runs)]
-        new = [one for one in found if one[0] in EXPERIMENTS and self.hashes.get(one) != finished(runs, *one)["config"]]
+        rows = [finished(runs, name, seed) for name, seed in _folders(runs)]
+        kept = [(row["experiment"], row["seed"], row["config"]) for row in rows if row]
+        new = [(name, seed) for name, seed, config in kept if self.hashes.get((name, seed)) != config]
         self.add(runs, *new)
         return len(new)
 
 
-def _rows(runs):
-    return sorted(Path(runs).glob("*/seed-*/row.json"))
+def _folders(runs):
+    """(name, seed) of the folders of runs of experiments."""
+    paths = sorted(Path(runs).glob("*/seed-*/row.json"))
+    parts = [(path.parent.parent.name, path.parent.name.removeprefix("seed-")) for path in paths]
+    return [(name, int(seed)) for name, seed in parts if name in EXPERIMENTS and seed.isdecimal()]
 
 
 def _text(value):
     return "" if value is None else str(value)
-
-
-__all__ = ["COLUMNS", "FIGURES", "Results", "minutes", "place", "read"]

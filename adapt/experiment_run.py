@@ -19,8 +19,10 @@ from pathlib import Path
 
 from adapt import command
 from adapt.experiment_table import EXPERIMENTS
+from envs.errors import InputError
 
 CURVE = ("update", "samples", "seconds", "error", "success")
+FILES = ("config.json", "metrics.json")  # of a command that writes a folder
 VERSIONS = ("python", "torch", "torchrl", "tensordict", "casadi")
 
 
@@ -37,6 +39,7 @@ def run(name, seed, root):
         RuntimeError: a step failed; says which, and where the log is.
     """
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    root = Path(root).resolve()  # a policy's path is part of what a training run is
     experiment, folder = EXPERIMENTS[name], place(root, name, seed)
     folder.mkdir(parents=True, exist_ok=True)
     with _alone(folder / "lock"):
@@ -47,7 +50,7 @@ def run(name, seed, root):
         with (folder / "log.txt").open("a") as log, _printed_to(log):
             try:
                 done = [_carry_out(number, root, name, seed) for number in range(len(experiment.steps))]
-                row = {"experiment": name, "seed": seed, **_row(experiment, folder, done), "config": config}
+                row = {"experiment": name, "seed": seed, **_row(experiment, root, seed, done), "config": config}
             except Exception as error:
                 traceback.print_exc()
                 told = " ".join(str(error).split()) or type(error).__name__
@@ -62,9 +65,18 @@ def place(root, name, seed):
 
 
 def finished(root, name, seed):
-    """The row of a finished run, or None."""
-    path = place(root, name, seed) / "row.json"
-    return json.loads(path.read_text()) if path.is_file() else None
+    """The row of a finished run, or None; a row that can't be read counts as none."""
+    row = _record(place(root, name, seed) / "row.json")
+    return row if {"experiment", "seed", "error", "config"} <= row.keys() else None
+
+
+def _record(path):
+    """What a JSON file holds; nothing where it is missing or damaged, as then its step is done again."""
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def curve(root, name, seed):
@@ -98,13 +110,16 @@ def _settings(step):
     Options that are off don't count, so that a new one of a command changes no hash.
     """
     from adapt import pretrain
-    from envs import make_system
+    from envs import make_system, make_task
+    from envs.camera import Camera
     from policies import METHODS, pixel_mpc
+    from policies.evaluate import TEST_EPISODES
 
     given = import_module(step.command).Options(**step.options)
     yield repr(sorted((k, v) for k, v in asdict(given).items() if v is not None and v is not False and v != ()))
     system = make_system(step.options.get("system", "cartpole"))
     yield repr(system)
+    yield repr((_asked(make_task(system)), TEST_EPISODES.get(system.name)))
     method = step.options.get("method", "apg") + ("-pixels" if step.options.get("pixels") else "")
     if step.command == "adapt.pretrain":
         yield repr(pretrain.configuration(given, system))
@@ -112,10 +127,18 @@ def _settings(step):
         module = METHODS[method].module
         yield repr(module.finetuning(module.PRESETS.get(system.name, module.Config())))
     elif step.command == "adapt.vision":
+        yield repr(Camera())
         yield repr((METHODS[f"{method}-pixels"].module if method != "mpc" else pixel_mpc).Config())
 
 
-def _resolved(step, root, seed, name="self"):
+def _asked(task):
+    """What a task asks: its fields, and the plain values of its class, such as weights and thresholds."""
+    values = {key: value for one in reversed(type(task).__mro__) for key, value in vars(one).items()}
+    plain = {key: value for key, value in values.items() if isinstance(value, int | float | str | tuple | dict)}
+    return task, sorted((key, value) for key, value in plain.items() if not key.startswith("_"))
+
+
+def resolved(step, root, seed, name="self"):
     """The options of a step with folders and seed filled in."""
     folders = {other: str(place(root, other, seed)) for other in step.needs}
     folders |= {"self": str(place(root, name, seed)), "seed": seed}
@@ -129,51 +152,60 @@ def _carry_out(number, root, name, seed):
     """Run a step unless it is recorded as done with the same settings, those of all before it among them."""
     step, folder = EXPERIMENTS[name].steps[number], place(root, name, seed)
     path, config = folder / f"{step.out}.step.json", step_hash(name, number)
-    record = json.loads(path.read_text()) if path.is_file() else {}
+    record = _record(path)
     same = record.get("config") == config
     if same and record.get("done"):
         return record
-    module = import_module(step.command)
-    record = {"command": step.command, "options": step.options, "config": config, "done": False}
+    spent = record.get("seconds", 0.0) if same else 0.0
+    record = {"command": step.command, "options": step.options, "config": config, "done": False, "seconds": spent}
     command.write_json(path, record)
-    known = {field.name for field in fields(module.Options)}
-    out = {"out": str(folder / step.out)}
-    goes_on = same and "resume" in known and (folder / step.out / "training.pt").is_file()
-    out |= {"resume": True} if goes_on else {"overwrite": True}
     begun = time.perf_counter()
-    module.main(module.Options(**_resolved(step, root, seed, name), **out))
-    record |= {"done": True, "seconds": round(time.perf_counter() - begun, 1)}
-    command.write_json(path, record)
+    try:
+        _call(step, resolved(step, root, seed, name), folder / step.out, goes_on=same)
+        record["done"] = True
+    finally:
+        record["seconds"] = round(spent + time.perf_counter() - begun, 1)
+        command.write_json(path, record)
     return record
 
 
-def _row(experiment, folder, done):
+def _call(step, options, out, goes_on):
+    """Run a command; one that can go on does, and where it refuses to, because files are damaged, it begins again."""
+    module = import_module(step.command)
+    can = "resume" in {item.name for item in fields(module.Options)} and (out / "training.pt").is_file()
+    if goes_on and can:
+        try:
+            return module.main(module.Options(**options, out=str(out), resume=True))
+        except InputError:
+            traceback.print_exc()
+    return module.main(module.Options(**options, out=str(out), overwrite=True))
+
+
+def _row(experiment, root, seed, done):
     """The figures of a run, from what its last step has written."""
-    last = experiment.steps[-1]
-    found = json.loads((folder / last.out).read_text()) if last.out.endswith(".json") else {}
-    if not found:
-        found = {}
-        for name in ("config.json", "metrics.json"):
-            path = folder / last.out / name
-            found |= json.loads(path.read_text()) if path.is_file() else {}
-    row = READERS[last.command](found) | _spent(experiment, folder)
-    setting = experiment.setting
+    folder, last, setting = place(root, experiment.name, seed), experiment.steps[-1], experiment.setting
+    files = [folder / last.out] if last.out.endswith(".json") else [folder / last.out / n for n in FILES]
+    found = {key: value for path in files if path.is_file() for key, value in json.loads(path.read_text()).items()}
+    row = READERS[last.command](found) | _spent(experiment, root, seed)
     row |= {"set": found.get("set", ""), "target": " ".join(setting.get("target", ()))}
     row |= {key: setting.get(key, "") for key in ("horizon", "mode")}
-    row |= {key: found[key] for key in ("system", "metric", "unit") if key in found}
-    row["system"] = setting.get("system", row.get("system", "cartpole"))
-    row |= {"wall_s": round(sum(record["seconds"] for record in done), 1), "threads": found["threads"]}
+    row |= {"system": setting.get("system", found.get("system", "")), "metric": found["metric"], "unit": found["unit"]}
+    seconds = [record["seconds"] for record in done]
+    row |= {"wall_s": "" if None in seconds else round(sum(seconds), 1), "threads": found["threads"]}
     row |= {key: found[key] for key in VERSIONS}
     return row | {"commit": " ".join(_commits(experiment, folder, found))}
 
 
-def _spent(experiment, folder):
-    """Samples and seconds of a whole training, not only until the policy that was kept."""
-    log = folder / "training" / "log.csv"
-    if experiment.steps[0].command != "adapt.pretrain" or not log.is_file():
+def _spent(experiment, root, seed):
+    """Samples and seconds of the whole training that a flown policy comes from, not only until it was kept."""
+    if experiment.steps[-1].command != "adapt.evaluate":
         return {}
-    last = list(csv.DictReader(log.read_text().splitlines()))[-1]
-    return {"samples": int(last["samples"]), "seconds": round(float(last["seconds"]), 1)}
+    for name in (experiment.name, *experiment.needs):
+        log = place(root, name, seed) / "training" / "log.csv"
+        if EXPERIMENTS[name].steps[0].command == "adapt.pretrain" and log.is_file():
+            last = list(csv.DictReader(log.read_text().splitlines()))[-1]
+            return {"samples": int(last["samples"]), "seconds": round(float(last["seconds"]), 1)}
+    return {}
 
 
 def _commits(experiment, folder, found):

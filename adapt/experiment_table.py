@@ -17,8 +17,9 @@ MODES = ("concurrent", "autoregressive", "recurrent")
 LONGEST = HORIZONS[-1]  # whose test paths all horizons fly
 # Transitions in the target: the paper's budgets, and few.
 BUDGETS = {"quadrotor": (30, 100, 300, 1000), "fixed_wing": (30, 100, 300, 1000, 2000, 5000)}
-RIVAL_BUDGETS = {"quadrotor": (30, 100, 300, 1000, 5000), "fixed_wing": (30, 100, 300, 1000, 2000, 5000)}
+PPO_BUDGETS = {"quadrotor": (30, 100, 300, 1000, 5000), "fixed_wing": (30, 100, 300, 1000, 2000, 5000)}
 MANY = 150_000
+MOST_SEEDS = 10_000
 # What 150 000 transitions of the fixed wing are best used with, found on validation episodes: it has to learn to hold
 # its height again. With fewer transitions these settings do harm.
 MANY_SETTINGS = {"quadrotor": {}, "fixed_wing": {"exploration": 0.3, "learning_rate": 1e-3, "curriculum": 0.3}}
@@ -160,7 +161,7 @@ def in_drag():
         for samples in BUDGETS[system]:
             yield adapted(system, samples)
             yield planned(system, samples)
-        for samples in (*RIVAL_BUDGETS[system], MANY):
+        for samples in (*PPO_BUDGETS[system], MANY):
             yield continued(system, "ppo", samples, **(MANY_SETTINGS[system] if samples == MANY else {}))
         for samples in (*BUDGETS[system], MANY):
             yield continued(system, "pets", samples)
@@ -216,5 +217,7 @@ def seeds_of(text):
         if not (match := re.fullmatch(r"(\d+)(?:\.\.(\d+))?", part.strip())):
             raise ValueError(part)
         first, last = int(match[1]), int(match[2] or match[1])
+        if not first <= last < MOST_SEEDS:
+            raise ValueError(part)
         seeds += range(first, last + 1)
     return tuple(dict.fromkeys(seeds))

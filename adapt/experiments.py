@@ -15,6 +15,7 @@ import tyro
 from adapt import command, experiment_table
 from envs.errors import InputError
 
+MINUTES = {"adapt.pretrain": 2.0, "adapt.evaluate": 0.5, "adapt.fewshot": 0.5, "adapt.vision": 5.0}
 Names = Annotated[tuple[str, ...], tyro.conf.Positional]
 
 
@@ -25,7 +26,7 @@ class List:
     names: Names = ()
     """Experiments, tables such as table1, or patterns such as 'drag-apg-*' (default: all)."""
     commands: bool = False
-    """Also show the commands that make a row by hand."""
+    """Also show the commands that make a row by hand: those of seed 0."""
     results: str = "results"
     """Folder with experiments.csv."""
 
@@ -130,17 +131,24 @@ def _list(options):
         for name, *_ in rows:
             print(f"\n{name}:")
             for step in experiment_table.EXPERIMENTS[name].steps:
-                print(f"  {said(step)}")
+                print(f"  {said(step, name)}")
 
 
-def said(step):
-    """A step as a command line, with its placeholders."""
+def weight(experiment):
+    """About how many minutes a run takes where none has been timed: a matter of its commands alone."""
+    return sum(MINUTES[step.command] for step in experiment.steps)
+
+
+def said(step, name, root="runs/experiments", seed=0):
+    """A step as a command line: that of seed 0, in the folders that `run` uses."""
+    from adapt.experiment_run import place, resolved
+
     words = [f"python -m {step.command}"]
-    for key, value in step.options.items():
+    for key, value in resolved(step, Path(root), seed, name).items():
         flag = f"--{key.replace('_', '-')}"
         values = value if isinstance(value, tuple) else (value,)
         words += [flag] if value is True else [f"{flag} {part}" for part in values]
-    return " ".join([*words, f"--out {{self}}/{step.out}"])
+    return " ".join([*words, f"--out {place(root, name, seed) / step.out}"])
 
 
 def _tabulated(rows, header):
@@ -152,18 +160,17 @@ def _tabulated(rows, header):
 def _run(options):
     from adapt import experiment_results, sweep
 
-    runs = sweep.chosen(_wanted(options), _seeds(options.seeds))
     _check_array(options)
+    runs = sweep.chosen(_wanted(options), _seeds(options.seeds))
     results = experiment_results.Results(options.results, None if options.index is not None else options.runs)
-    minutes = lambda one: results.minutes(one[0]) or 1.0  # noqa: E731
     if options.index is not None:
-        runs = sweep.part(runs, options.index, options.of, minutes)
+        runs = sweep.part(runs, options.index, options.of, lambda one: weight(experiment_table.EXPERIMENTS[one[0]]))
     tasks = sweep.plan(runs, results.done(options.runs), results.outputs(options.runs))
     if not tasks:
         print(f"nothing to do: all {len(runs)} rows are there")
         return
     engine, jobs = _engine(options)
-    failed = _sweep(options, tasks, engine, jobs, results, minutes)
+    failed = _sweep(options, tasks, engine, jobs, results)
     print(f"{len(tasks) - len(failed)} of {len(tasks)} runs done; rows in {results.where(options.runs)}")
     if failed:
         first = next(iter(failed.values()))
@@ -174,11 +181,16 @@ def _wanted(options):
     """The names that are asked for; what takes a cluster only if it is named, not by a pattern."""
     if not options.names:
         raise InputError("no experiments: name some, such as table1, 'drag-apg-*' or all; `list` shows them")
-    known = experiment_table.EXPERIMENTS
-    return [name for name in pick(options.names) if not known[name].cluster or name in options.names]
+    known, names = experiment_table.EXPERIMENTS, pick(options.names)
+    wanted = [name for name in names if not known[name].cluster or name in options.names]
+    if left := [name for name in names if name not in wanted]:
+        print(f"left out, as they take a cluster: {', '.join(left)}; name them to run them")
+    return wanted
 
 
 def _check_array(options):
+    if options.of is not None and options.of < 1:
+        raise InputError(f"--of {options.of}: expected at least 1")
     if (options.index is None) != (options.of is None):
         raise InputError("--index and --of: give both or neither")
     if options.index is not None and not 0 <= options.index < options.of:
@@ -205,14 +217,15 @@ def _engine(options):
     return engine, options.jobs or engine.cpus
 
 
-def _sweep(options, tasks, engine, jobs, results, minutes):
+def _sweep(options, tasks, engine, jobs, results):
     """Carry out the runs under a bar over the minutes that they take; rows are kept as they come."""
     from tqdm import tqdm
 
     from adapt import sweep
 
-    root = Path(options.runs)
-    total = sum(map(minutes, tasks))
+    root, known = Path(options.runs), experiment_table.EXPERIMENTS
+    minutes = {one: results.minutes(one[0]) or weight(known[one[0]]) for one in tasks}
+    total = sum(minutes.values())
     form = "{l_bar}{bar}| {postfix} [{elapsed}<{remaining}]"
     with tqdm(total=total, desc="experiments", bar_format=form) as bar:
         count = 0
@@ -222,7 +235,7 @@ def _sweep(options, tasks, engine, jobs, results, minutes):
             count += 1
             results.add(root, one)
             bar.set_postfix_str(f"{count} of {len(tasks)} runs, last {one[0]} seed {one[1]}: {_error(row)}")
-            bar.update(minutes(one))
+            bar.update(minutes[one])
 
         try:
             with command.terminated_as_interrupted():
@@ -240,7 +253,7 @@ def _status(options):
 
     names, seeds = pick(options.names or ("all",)), _seeds(options.seeds)
     results = experiment_results.Results(options.results)
-    rows, left = [], 0.0
+    rows, left, untimed = [], 0.0, 0
     for name in names:
         runs = sweep.chosen([name], seeds)
         done = [one for one in runs if results.state(one) == "done"]
@@ -248,11 +261,13 @@ def _status(options):
         minutes = results.minutes(name)
         cluster = experiment_table.EXPERIMENTS[name].cluster
         missing = len(runs) - len(done)
-        left += 0.0 if cluster else missing * (minutes or 1.0)
+        left += 0.0 if cluster else missing * (minutes or 0.0)
+        untimed += 0 if cluster or minutes else missing
         note = "for a cluster" if cluster else ""
         rows.append((name, f"{len(done)} of {len(runs)}", len(old) or "", minutes and f"{minutes:.1f}", note))
     print(_tabulated(rows, ("experiment", "done", "with other settings", "minutes a seed", "")))
-    print(f"about {left:.0f} minutes of one core are left")
+    rest = f", and {untimed} runs that have never been timed" if untimed else ""
+    print(f"about {left:.0f} minutes of one core are left{rest}")
 
 
 def _gather(options):

@@ -99,7 +99,7 @@ def main(options):
     command.write_json(folder / "metrics.json", metrics)
     print(report.table(metrics))
     _pictures(options, adaptation, folder)
-    print(f"results in {folder}/: metrics.json, policy.safetensors, residual.safetensors, transitions.csv, pictures")
+    print(f"results in {folder}/: {', '.join(RESULTS[1:])}, pictures")
 
 
 def _write_tuning(history, path):

@@ -8,6 +8,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import threading
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from functools import partial
 from graphlib import TopologicalSorter
@@ -54,7 +55,7 @@ def part(runs, index, of, minutes):
     do, so every job finds the same parts.
 
     Args:
-        minutes: (name, seed) → how long it takes.
+        minutes: (name, seed) → about how long it takes; the same for every job, whatever is done in the meantime.
     """
     load, parts = [0.0] * of, [[] for _ in range(of)]
     chains = [[one for one in runs if one in chain] for chain in _chains(runs)]
@@ -85,11 +86,12 @@ def sweep(tasks, root, engine, jobs, finished_one):
 
     Raises:
         KeyboardInterrupt: after the runs that were going on have saved what they had.
+        InputError: a row can't be kept; the runs that were going on have saved what they had, too.
     """
     pool = ThreadPoolExecutor(jobs)
     try:
         return _carry_out(tasks, root, partial(pool.submit, engine), finished_one)
-    except KeyboardInterrupt:
+    except BaseException:  # Ctrl-C, or a row that can't be kept
         pool.shutdown(wait=False, cancel_futures=True)
         engine.stop()
         raise
@@ -147,14 +149,28 @@ class Pool:
 
 
 def _child(name, seed, root):
-    """The process of a run. It heeds SIGINT even where the sweep was begun with that ignored, as in the background."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    """The process of a run. It is told to stop by the sweep alone, once, or by the end of the sweep.
+
+    Ctrl-C reaches every process of a terminal; a second one would end the run before it has saved what it has. A sweep
+    that is killed takes its runs with it, and they save what they have, too.
+    """
+    if hasattr(os, "setsid"):
+        os.setsid()
+    for number in (signal.SIGINT, signal.SIGTERM):  # ignored in a process of the background, or deadly
+        signal.signal(number, signal.default_int_handler)
+    threading.Thread(target=_follow, daemon=True).start()
     try:
         run(name, seed, root)
     except KeyboardInterrupt:
         raise SystemExit(INTERRUPTED) from None
     except RuntimeError:  # its log says what went wrong
         raise SystemExit(1) from None
+
+
+def _follow():
+    """Interrupt this process when the sweep that began it has ended."""
+    multiprocessing.parent_process().join()
+    os.kill(os.getpid(), signal.SIGINT)
 
 
 def _what_happened(name, seed, root, exitcode):
@@ -184,7 +200,7 @@ class Ray:
         quiet = {"log_to_driver": False, "include_dashboard": False} if address == "local" else {}
         place = {"num_cpus": cpus, "address": "local"} if address == "local" else {"address": address}
         ray.init(**place, **quiet, runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}}, logging_level="ERROR")
-        self.ray, self.task = ray, ray.remote(num_cpus=1, max_calls=1)(run)
+        self.ray, self.task, self.going = ray, ray.remote(num_cpus=1, max_calls=1)(run), set()
 
     @property
     def cpus(self):
@@ -193,8 +209,20 @@ class Ray:
 
     def __call__(self, name, seed, root):
         """Carry out a run and wait for its row."""
-        return self.ray.get(self.task.remote(name, seed, str(root.resolve())))
+        task = self.task.remote(name, seed, str(root))
+        self.going.add(task)
+        try:
+            return self.ray.get(task)
+        except self.ray.exceptions.RayTaskError as error:
+            raise RuntimeError(str(error.cause)) from None
+        finally:
+            self.going.discard(task)
 
     def stop(self):
-        """Leave the cluster; its tasks end."""
+        """Have the runs save what they have and end, then leave the cluster."""
+        tasks = list(self.going)
+        for task in tasks:
+            self.ray.cancel(task, force=False)
+        if tasks:
+            self.ray.wait(tasks, num_returns=len(tasks), timeout=GRACE)
         self.ray.shutdown()

@@ -16,8 +16,8 @@ METHODS = {"mpc": "MPC", "ppo": "PPO", "pets": "PETS", "apg": "APG"}
 SYSTEM_NAMES = {"cartpole": "CartPole [m/s]", "quadrotor": "quadrotor [m]", "fixed_wing": "fixed wing [m]"}
 MODE_NAMES = {"concurrent": "concurrent", "autoregressive": "autoregressive", "recurrent": "LSTM"}
 HOW = (
-    "Mean ± standard deviation over seeds of the mean error over the test episodes; in brackets the share of episodes"
-    " that succeed, where it is below 100 %. Published: ± over test episodes. **Bold**: at or below the best published"
+    "Mean ± standard deviation over seeds of the mean error over the test episodes that succeed; in brackets"
+    " their share, where it is below 100 %. Published: ± over test episodes. **Bold**: at or below the best published"
     " learning-based value for the same system and setting, with no fewer successes."
 )
 SAMPLES = "Samples: transitions learned from."

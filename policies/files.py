@@ -12,7 +12,7 @@ from envs.errors import InputError
 def whole(path):
     """A temporary name beside `path` that takes its place when the block ends well, and vanishes when it doesn't."""
     path = Path(path)
-    partial = path.with_name(f".partial-{path.name}")
+    partial = path.with_name(f".partial-{os.getpid()}-{path.name}")
     try:
         yield partial
         os.replace(partial, path)

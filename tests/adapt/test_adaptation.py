@@ -178,7 +178,7 @@ def test_it_needs_something_to_learn_from(rough_cartpole, options, words):
 
 
 def test_an_unknown_kind_and_too_few_transitions_are_refused(rough_cartpole, target):
-    with pytest.raises(InputError, match="--residual jerk: expected one of acceleration, state"):
+    with pytest.raises(InputError, match="--residual jerk: expected one of auto, parameters"):
         adapt(rough_cartpole, target, samples=30, kind="jerk")
     with pytest.raises(InputError, match=f"5 transitions, at least {MINIMUM} are needed"):
         adapt(rough_cartpole, target, samples=5)
@@ -262,8 +262,9 @@ def test_in_rounds_each_part_is_flown_by_the_policy_tuned_on_those_before(rough_
 
 
 def test_to_watch_flies_validation_episodes_in_the_target(rough_cartpole, target):
-    judge = adaptation.Judge(rough_cartpole, target, rough_cartpole.task, every=5, episodes=4)
-    assert judge(rough_cartpole.network, 4) == {}
+    judge = adaptation.Judge(rough_cartpole, target, rough_cartpole.task, every=5, last=11, episodes=4)
+    assert judge(rough_cartpole.network, 4) == {} and judge.seconds == 0
+    assert set(judge(rough_cartpole.network, 11)) == {"error", "success"} and judge.seconds > 0
     unseen = rough_cartpole.task.episodes(4, "validation", 0)
     found = adaptation.evaluate(as_actor(rough_cartpole.network), target, rough_cartpole.task, unseen).summary
     assert judge(rough_cartpole.network, 10) == {"error": found["mean"], "success": found["success"]}

@@ -104,6 +104,65 @@ def test_another_table_is_refused(tmp_path):
         results.read(tmp_path)
 
 
+def add_rows(folder, name, count):
+    table = results.Results(folder / "results", folder / "runs")
+    for seed in range(count):
+        table.add(folder / "runs", finish(folder / "runs", name, seed))
+
+
+def test_two_sweeps_that_add_to_the_same_tables_lose_no_row(tmp_path):
+    import multiprocessing
+
+    names = ("apg-quadrotor", "ppo-quadrotor")
+    context = multiprocessing.get_context("fork")
+    processes = [context.Process(target=add_rows, args=(tmp_path, name, 15)) for name in names]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+        assert process.exitcode == 0
+    assert len(results.read(tmp_path / "results")) == 30
+
+
+def test_a_policy_of_other_settings_is_not_taken_for_one_that_is_needed(tables, tmp_path):
+    one = finish(tmp_path / "runs", "apg-quadrotor", 0)
+    other = finish(tmp_path / "runs", "apg-quadrotor", 1, config="other")
+    has = tables.outputs(tmp_path / "runs")
+    assert has(one) and not has(other) and not has(("apg-quadrotor", 2))
+
+
+def test_an_array_does_not_repeat_rows_that_the_results_hold(tables, tmp_path):
+    one = finish(tmp_path / "runs", "apg-quadrotor", 0)
+    tables.add(tmp_path / "runs", one)
+    assert results.Results(tmp_path / "results").done(tmp_path / "elsewhere")(one)
+
+
+@pytest.mark.parametrize("seed", ["x", "-1", "1.5", ""])
+def test_a_seed_that_is_none_is_refused(tables, tmp_path, seed):
+    tables.add(tmp_path / "runs", finish(tmp_path / "runs", "apg-quadrotor", 0))
+    path = tmp_path / "results" / "experiments.csv"
+    path.write_text(path.read_text().replace("apg-quadrotor,0,", f"apg-quadrotor,{seed},"))
+    with pytest.raises(InputError, match=f"line 2: seed is '{seed}', expected an integer"):
+        results.read(tmp_path / "results")
+
+
+def test_what_cannot_be_kept_is_told_before_the_first_run(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="is a file, expected a folder"):
+        results.Results(tmp_path / "file", tmp_path / "runs")
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "curves.csv").write_text("a,b\n")
+    with pytest.raises(InputError, match=r"curves\.csv: has no column experiment"):
+        results.Results(tmp_path / "results", tmp_path / "runs")
+
+
+def test_other_folders_among_the_runs_are_not_gathered(tmp_path):
+    for folder in ("other/seed-0", "apg-quadrotor/seed-x", "apg-quadrotor/seed-1"):
+        (tmp_path / "runs" / folder).mkdir(parents=True)
+        (tmp_path / "runs" / folder / "row.json").write_text("{")
+    assert results.Results(tmp_path / "results", tmp_path / "runs").gather(tmp_path / "runs") == 0
+
+
 def test_the_committed_results_name_experiments_that_exist():
     """`read` refuses others; an empty folder is a project without results."""
     from pathlib import Path

@@ -142,3 +142,63 @@ def test_the_curve_of_a_training_run_holds_its_validations(tiny, tmp_path):
         ("tiny", 0, "2", "8"),
         ("tiny", 0, "4", "16"),
     ]
+
+
+@pytest.mark.parametrize("name", ["row.json", "evaluation.json.step.json", "training.step.json"])
+@pytest.mark.parametrize("content", ["{", "[]", "{}"])
+def test_a_damaged_record_counts_as_none(tiny, calls, tmp_path, name, content):
+    runs.run("tiny", 0, tmp_path)
+    folder = tmp_path / "tiny" / "seed-0"
+    (folder / "row.json").unlink()
+    (folder / name).write_text(content)
+    assert runs.run("tiny", 0, tmp_path)["samples"] == 16
+    again = {"row.json": 2, "evaluation.json.step.json": 3, "training.step.json": 3}[name]
+    assert len(calls) == again
+
+
+def test_training_that_cannot_go_on_begins_again(tiny, calls, tmp_path, monkeypatch):
+    with monkeypatch.context() as broken:
+        broken.setattr(evaluate, "main", lambda options: 1 / 0)
+        with pytest.raises(RuntimeError):
+            runs.run("tiny", 0, tmp_path)
+    folder = tmp_path / "tiny" / "seed-0"
+    record = json.loads((folder / "training.step.json").read_text())
+    (folder / "training.step.json").write_text(json.dumps(record | {"done": False}))
+    (folder / "training" / "training.pt").write_bytes(b"damaged")
+    assert runs.run("tiny", 0, tmp_path)["samples"] == 16
+    assert [options.resume for name, options in calls if name == "pretrain"] == [False, True, False]
+    assert "training.pt is damaged" in (folder / "log.txt").read_text()
+
+
+def test_the_time_of_all_attempts_and_steps_counts(tiny, tmp_path, monkeypatch):
+    row = runs.run("tiny", 0, tmp_path)
+    folder = tmp_path / "tiny" / "seed-0"
+    for step, seconds in (("training", 100.0), ("evaluation.json", 20.0)):
+        record = json.loads((folder / f"{step}.step.json").read_text())
+        (folder / f"{step}.step.json").write_text(json.dumps(record | {"seconds": seconds}))
+    (folder / "row.json").unlink()
+    assert runs.run("tiny", 0, tmp_path)["wall_s"] == 120.0 > row["wall_s"]
+    (folder / "row.json").unlink()
+    (folder / "evaluation.json.step.json").write_text(json.dumps(record | {"seconds": 20.0, "done": False}))
+    assert runs.run("tiny", 0, tmp_path)["wall_s"] > 120.0
+
+
+def test_a_row_names_every_commit_that_its_steps_were_done_at(tiny, tmp_path):
+    runs.run("tiny", 0, tmp_path)
+    folder = tmp_path / "tiny" / "seed-0"
+    config = json.loads((folder / "training" / "config.json").read_text())
+    (folder / "training" / "config.json").write_text(json.dumps(config | {"commit": "0ld"}))
+    (folder / "row.json").unlink()
+    assert runs.run("tiny", 0, tmp_path)["commit"] == f"0ld {config['commit']}"
+
+
+def test_who_flies_the_policy_of_another_experiment_tells_its_samples(tiny, tmp_path):
+    runs.run("tiny", 0, tmp_path)
+    assert runs.run("tiny-push", 0, tmp_path)["samples"] == 16
+
+
+def test_the_folder_of_the_runs_may_be_spelled_in_any_way(tiny, calls, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    runs.run("tiny", 0, "here")
+    runs.run("tiny-push", 0, tmp_path / "here")
+    assert calls[-1][1].policy == calls[-2][1].policy == str(tmp_path / "here/tiny/seed-0/training/policy.safetensors")

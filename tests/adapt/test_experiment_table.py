@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from adapt.experiment_run import READERS, _resolved, config_hash, place, step_hash
+from adapt.experiment_run import READERS, config_hash, place, resolved, step_hash
 from adapt.experiment_table import EXPERIMENTS, Experiment, Step, needed, seeds_of
 from adapt.experiments import said
 from policies import METHODS
@@ -18,7 +18,7 @@ def experiment(request):
 
 def test_every_step_is_a_command_that_takes_its_options(experiment):
     for step in experiment.steps:
-        options = import_module(step.command).Options(**_resolved(step, Path("runs"), 3, experiment.name))
+        options = import_module(step.command).Options(**resolved(step, Path("runs"), 3, experiment.name))
         assert getattr(options, "seed", 3) in (3, 0)
         assert "{" not in repr(options)
 
@@ -80,16 +80,15 @@ def test_the_published_budgets_and_few_transitions_are_among_those_of_the_fourth
 
 
 def test_a_step_is_said_as_the_command_that_does_it():
-    step = Step(
-        "adapt.fewshot", {"system": "quadrotor", "target": ("drag=0.3", "mass=x1.2"), "oracle": True}, "adaptation"
-    )
-    expected = "python -m adapt.fewshot --system quadrotor --target drag=0.3 --target mass=x1.2 --oracle"
-    assert said(step) == f"{expected} --out {{self}}/adaptation"
+    options = {"system": "quadrotor", "target": ("drag=0.3", "mass=x1.2"), "oracle": True, "seed": "{seed}"}
+    expected = "python -m adapt.fewshot --system quadrotor --target drag=0.3 --target mass=x1.2 --oracle --seed 3"
+    told = said(Step("adapt.fewshot", options, "adaptation"), "mine", "runs", seed=3)
+    assert told == f"{expected} --out runs/mine/seed-3/adaptation"
 
 
 def test_placeholders_become_folders_of_the_same_seed():
     step = Step("adapt.evaluate", {"policy": "{apg-quadrotor}/training/policy.safetensors", "seed": "{seed}"}, "x.json")
-    filled = _resolved(step, Path("runs"), 4, "mine")
+    filled = resolved(step, Path("runs"), 4, "mine")
     assert filled == {"policy": "runs/apg-quadrotor/seed-4/training/policy.safetensors", "seed": 4}
     assert place("runs", "mine", 4) == Path("runs/mine/seed-4")
 
@@ -124,6 +123,27 @@ def test_the_hash_changes_with_the_default_of_an_option_but_not_with_a_new_one(m
     step_hash.cache_clear()
 
 
+def test_the_hash_changes_with_the_task_and_with_the_settings_of_the_fine_tuning(monkeypatch):
+    from dataclasses import replace
+
+    from envs.quadrotor import Tracking
+    from policies import apg, evaluate
+
+    name = "drag-apg-quadrotor-30"
+    changes = [(Tracking, "thresholds", (0.5, 5.0)), (apg, "FINETUNE", replace(apg.FINETUNE, updates=7))]
+    before = config_hash(name)
+    for where, what, value in changes:
+        with monkeypatch.context() as patch:
+            patch.setattr(where, what, value)
+            step_hash.cache_clear()
+            assert config_hash(name) != before, what
+    with monkeypatch.context() as patch:
+        patch.setitem(evaluate.TEST_EPISODES, "quadrotor", 3)
+        step_hash.cache_clear()
+        assert config_hash(name) != before
+    step_hash.cache_clear()
+
+
 def test_the_hash_changes_with_the_tuned_settings(monkeypatch):
     from dataclasses import replace
 
@@ -143,7 +163,7 @@ def test_seeds_are_numbers_and_ranges(text, seeds):
     assert seeds_of(text) == seeds
 
 
-@pytest.mark.parametrize("text", ["", "a", "1..", "-1", "1.5", "1...3"])
+@pytest.mark.parametrize("text", ["", "a", "1..", "-1", "1.5", "1...3", "5..2", "0..999999999999"])
 def test_other_seeds_are_refused(text):
     with pytest.raises(ValueError, match=r".*"):
         seeds_of(text)

@@ -32,14 +32,16 @@ def test_list_shows_what_is_needed_and_the_commands(call):
     answer = call("experiments", "list", "drag-mpc-quadrotor-30", "--commands")
     assert answer.status == 0
     assert "drag-apg-quadrotor-30" in answer.out
-    assert "python -m adapt.evaluate --system quadrotor --method mpc-residual --target drag=0.3" in answer.out
+    folder = "runs/experiments/drag-apg-quadrotor-30/seed-0/adaptation"
+    command = "python -m adapt.evaluate --system quadrotor --method mpc-residual --target drag=0.3 --residual "
+    assert f"{command}{folder}/residual.safetensors --out runs/experiments/drag-mpc" in answer.out
 
 
 def test_status_counts_what_is_missing(call, tmp_path):
     answer = call("experiments", "status", "curriculum", "--seeds", "0..2", "--results", tmp_path)
     assert answer.status == 0
     assert answer.out.count("0 of 3") == 4
-    assert "about 12 minutes" in answer.out  # one each, as nothing is known
+    assert "about 0 minutes of one core are left, and 12 runs that have never been timed" in answer.out
 
 
 @pytest.mark.parametrize(
@@ -50,7 +52,9 @@ def test_status_counts_what_is_missing(call, tmp_path):
         (("run", "table1", "--seeds", "x"), "--seeds x: expected such as 0, 0..4 or 0,2"),
         (("run", "table1", "--index", "0"), "--index and --of: give both or neither"),
         (("run", "table1", "--index", "2", "--of", "2"), "--index 2: expected between 0 and 1"),
+        (("run", "table1", "--index", "0", "--of", "0"), "--of 0: expected at least 1"),
         (("run", "table1", "--jobs", "0"), "--jobs 0: expected at least 1"),
+        (("run", "table1", "--seeds", "5..2"), "--seeds 5..2: expected such as"),
         (("walk",), "experiments: Unrecognized options: walk (see"),
     ],
 )
@@ -60,10 +64,11 @@ def test_wrong_options_end_in_one_line(refused, arguments, said, tmp_path):
     assert not (tmp_path / "runs").exists()
 
 
-def test_what_takes_a_cluster_is_run_only_if_it_is_named(tmp_path):
+def test_what_takes_a_cluster_is_run_only_if_it_is_named(capsys):
     from adapt.experiments import Run, _wanted
 
     assert "drag-pets-quadrotor-150000" not in _wanted(Run(("drag-pets-*",)))
+    assert "left out, as they take a cluster: drag-pets-quadrotor-150000" in capsys.readouterr().out
     assert _wanted(Run(("drag-pets-quadrotor-150000",))) == ["drag-pets-quadrotor-150000"]
 
 
@@ -91,6 +96,18 @@ def undisturbed(tmp_path_factory):
     return figures(folder)
 
 
+def alive(folder):
+    """Whether a process still works on a run of the folder."""
+    from filelock import FileLock, Timeout
+
+    try:
+        for path in folder.glob("runs/*/*/lock"):
+            FileLock(path, timeout=0).acquire().lock.release()
+    except Timeout:
+        return True
+    return False
+
+
 def wait_for(condition, seconds=240):
     end = time.monotonic() + seconds
     while not condition():
@@ -100,15 +117,17 @@ def wait_for(condition, seconds=240):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_a_sweep_that_is_ended_goes_on_without_losing_or_repeating_a_row(how, tmp_path, undisturbed):
+@pytest.mark.parametrize("all_processes", [True, False])  # as a terminal does it or a scheduler, and as `kill` does
+def test_a_sweep_that_is_ended_goes_on_without_losing_or_repeating_a_row(how, all_processes, tmp_path, undisturbed):
     log = tmp_path / "runs" / "check-train" / "seed-0" / "training" / "log.csv"
     process = sweep(tmp_path, start_new_session=True)
     wait_for(log.is_file)
-    os.killpg(process.pid, how) if how == signal.SIGKILL else process.send_signal(how)
+    os.killpg(process.pid, how) if all_processes else process.send_signal(how)
     _, err = process.communicate(timeout=200)
     assert process.returncode == (-how if how == signal.SIGKILL else 130), err
     if how != signal.SIGKILL:
         assert "goes on from there" in err.splitlines()[-1] and "Traceback" not in err
+    wait_for(lambda: not alive(tmp_path))  # what a killed sweep began saves what it has, and ends
     rows = {path: path.stat().st_mtime_ns for path in tmp_path.glob("runs/*/*/row.json")}
     begun = log.read_text().splitlines()[1]
     _, err = (again := sweep(tmp_path)).communicate()

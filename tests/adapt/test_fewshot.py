@@ -488,7 +488,9 @@ def test_each_update_of_the_fine_tuning_is_written_and_the_target_is_flown_where
     assert call("fewshot", *cart, "--watch", 2, "--out", tmp_path / "watched").status == 0
     watched = pd.read_csv(tmp_path / "watched" / "tuning.csv")
     assert list(watched["update"]) == [1, 2, 3] and watched.seconds.is_monotonic_increasing
-    assert list(watched.error.notna()) == [False, True, False]
+    assert list(watched.error.notna()) == [False, True, True]  # and after the last
+    seconds = json.loads((tmp_path / "watched" / "metrics.json").read_text())["seconds"]
+    assert seconds["watch"] > 0 and seconds["finetune"] > 0
     assert call("fewshot", *cart, "--out", tmp_path / "plain").status == 0
     plain = pd.read_csv(tmp_path / "plain" / "tuning.csv")
     assert "error" not in plain and list(plain.cost) == list(watched.cost)  # to watch changes nothing

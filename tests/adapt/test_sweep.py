@@ -92,6 +92,18 @@ def test_an_interrupt_stops_the_engine_and_begins_nothing_more():
     assert len([event for event in engine.events if event[0] == "begin"]) < 10
 
 
+def test_a_row_that_cannot_be_kept_ends_the_sweep():
+    engine = Recorded(seconds=0.02)
+
+    def full(one, row):
+        raise OSError("no space left")
+
+    with pytest.raises(OSError, match="no space"):
+        sweep.sweep({("apg-cartpole", seed): [] for seed in range(50)}, Path("x"), engine, 2, full)
+    assert engine.stopped
+    assert len([event for event in engine.events if event[0] == "begin"]) < 10
+
+
 def test_the_plan_holds_what_is_not_done_and_what_it_needs():
     runs = [(name, 0) for name in NAMES]
     everything = sweep.plan(runs, lambda one: False, lambda one: False)
