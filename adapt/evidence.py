@@ -7,7 +7,7 @@ were run with different settings.
 
 import csv
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -89,6 +89,7 @@ class Evidence:
     experiments: object
     curves: object
     published: object
+    asked: set = field(default_factory=set)  # keys of the published rows that were looked for
 
     @cached_property
     def _rows(self):
@@ -109,7 +110,19 @@ class Evidence:
 
     def paper(self, table, system, method, setting):
         """A row of published.csv, or None."""
+        self.asked.add((table, system, method, setting))
         return self._papers.get((table, system, method, setting))
+
+    def unused(self):
+        """What published.csv holds and nobody has asked for: the words that tell a row, of the first."""
+        return next((" ".join(key) for key in self._papers if key not in self.asked), None)
+
+    def old(self):
+        """Experiments whose rows were made with other settings than those of the present code."""
+        from adapt.experiment_run import config_hash
+
+        configs = self.experiments.groupby("experiment", sort=False).config.first()
+        return [name for name, config in configs.items() if config and config != config_hash(name)]
 
 
 def read(folder):

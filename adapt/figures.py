@@ -217,7 +217,7 @@ def draw_samples(evidence):
             budgets = _budgets(evidence, method, system)
             names = {ZERO: f"drag-{method}-{system}-zero"} | {n: f"drag-{method}-{system}-{n}" for n in budgets}
             ran = {x: evidence.spread(name) for x, name in names.items() if evidence.rows(name) is not None}
-            label = "MPC + residual" if method == "mpc" else METHODS[method]
+            label = "MPC (+ residual)" if method == "mpc" else METHODS[method]
             if ran:
                 band(axes, list(ran), list(ran.values()), look, label=label)
             _best(axes, evidence, method, system, look[0])
@@ -263,7 +263,7 @@ def draw_learning(evidence):
             axes.set_title(TITLES[system])
             logarithmic(axes.xaxis, plain=False)
             logarithmic(axes.yaxis)
-            axes.set_xlabel("steps of the environment" if x == "samples" else "training time [s]")
+            axes.set_xlabel("steps of the environment" if x == "samples" else "training time, validation included [s]")
         row[0].set_ylabel("error of successful flights [m]")
     rows[0][0].plot([], [], color=GREY, label=f"less than {MOST:.0%} succeed", **FAILING_LOOK)
     figure.legend(*rows[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3)

@@ -38,20 +38,42 @@ def main(options):
     marks = marked(text, options.readme, LAYOUTS)
     known = evidence.read(options.results)
     tables = {name: layout(known) for name, layout in LAYOUTS.items()}
+    if known.unused():
+        raise InputError(f"{options.results}/published.csv: {known.unused()}: no table has such a row; mend its words")
     latex_files = {Path(options.results) / "tables" / f"{name}.tex": latex(name, t) for name, t in tables.items()}
     pictures = Path(options.results) / "figures"
     if options.check:
         check_readme(options.readme, text, marks, tables)
         check_files(latex_files)
         figures.check(known, pictures)
+        check_links(options.readme, text)
         print("tables and figures agree with the results")
+        _tell_old(known)
         return
     for path, content in {**latex_files, Path(options.readme): filled(text, marks, tables)}.items():
         _write(path, content)
     figures.draw_all(known, pictures)
-    print(
-        f"wrote {len(marks)} tables of {options.readme}, {len(latex_files)} to {options.results}/tables, and {pictures}"
-    )
+    there = f"{len(latex_files)} to {options.results}/tables, and {pictures}"
+    print(f"wrote {len(marks)} tables of {options.readme}, {there}")
+    _tell_old(known)
+
+
+def _tell_old(known):
+    """Rows that stand for earlier settings are shown all the same, but not without a word."""
+    if old := known.old():
+        advice = "python -m adapt.experiments run makes them again"
+        print(f"note: made with other settings than the present ones: {', '.join(old)}; {advice}")
+
+
+def check_links(path, text):
+    """Refuse a picture that a text shows and that isn't there.
+
+    Raises:
+        InputError: names the first.
+    """
+    for link in re.findall(r'<img src="([^":]+)"', text):
+        if not (Path(path).parent / link).is_file():
+            raise InputError(f"{path}: shows {link}, which isn't there; {MEND}")
 
 
 def _read(path):

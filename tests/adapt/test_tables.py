@@ -6,6 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from adapt.experiment_run import config_hash
 from adapt.table_layouts import LAYOUTS
 from adapt.tables import BEGIN, latex, marked
 
@@ -158,6 +159,30 @@ def test_what_cannot_be_read_is_refused_by_name(refused, project):
     assert "experiments.csv: can't be read" in refused("tables", "--results", readme.parent, "--readme", readme)
     readme.write_bytes(b"\xff")
     assert "README.md: can't be read (not UTF-8)" in refused("tables", *project)
+
+
+def test_a_published_value_that_no_table_asks_for_is_refused(refused, project):
+    path = project[1] / "published.csv"
+    path.write_text(path.read_text().replace("table1,quadrotor,apg,", "table1,quadrotor,APG,"))
+    assert "published.csv: table1 quadrotor APG source: no table has such a row" in refused("tables", *project)
+
+
+def test_a_picture_that_is_not_there_fails_the_check(call, refused, project):
+    readme = project[3]
+    readme.write_text(TEXT + '<img src="results/figures/horizon.png"><img src="https://example.org/a.png">\n')
+    call("tables", *project)
+    assert call("tables", *project, "--check").status == 0
+    readme.write_text(readme.read_text().replace("horizon.png", "gone.png"))
+    assert "shows results/figures/gone.png, which isn't there" in refused("tables", *project, "--check")
+
+
+def test_rows_of_other_settings_are_told(call, project):
+    path = project[1] / "experiments.csv"
+    table = pd.read_csv(path)
+    table["config"] = [config_hash("apg-quadrotor")] * 3 + ["0123456789ab"]
+    table.to_csv(path, index=False)
+    answer = call("tables", *project)
+    assert "note: made with other settings than the present ones: horizon-concurrent-10; " in answer.out
 
 
 def test_special_characters_are_escaped_in_captions_and_cells():
