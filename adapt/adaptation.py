@@ -11,6 +11,7 @@ import torch
 
 from adapt import residual as residuals
 from adapt.flying import collect, film_transitions, filmed
+from adapt.plants import flights_of
 from adapt.prediction import prediction_error
 from adapt.residual_dynamics import ResidualDynamics
 from adapt.transitions import Transitions, joined
@@ -39,6 +40,7 @@ class Adaptation:
     history: list[dict]  # metrics of each fine-tuning update
     seconds: dict[str, float] = field(default_factory=dict)
     oracle: Policy | None = None
+    flights: dict | None = None  # what flying a plant was like, see `adapt.plants.Flights.report`
 
 
 def finetuning(policy):
@@ -93,6 +95,7 @@ def adapt(
     policy,
     target=None,
     *,
+    plant=None,
     samples=1000,
     transitions=None,
     kind="acceleration",
@@ -101,6 +104,7 @@ def adapt(
     seed=0,
     config=None,
     oracle=False,
+    episodes=None,
     watch=None,
     context=None,
     seen=None,
@@ -114,6 +118,7 @@ def adapt(
         policy: a `Policy` that analytic policy gradients made; its task's system is the source.
         target: dynamics to fly and to evaluate in. None where the target is known by its transitions only: then
             policies are evaluated in the model with the residual, which stands in for it.
+        plant: a `Plant` to fly and to evaluate in instead, or `Flights` of one: its equations are not needed.
         samples: transitions to fly in the target; ignored where `transitions` are given.
         transitions: recorded `Transitions` to learn from instead.
         kind: of the residual, "acceleration" or "state".
@@ -123,6 +128,8 @@ def adapt(
         config: of the fine-tuning, see `finetune`.
         oracle: also fine-tune for as long in the true target, as a bound of what data could give; with several rounds,
             from the policy of the last.
+        episodes: test episodes that each policy is evaluated on (default: as many as the published tables use); fewer
+            for a plant that is slow or wears out.
         watch: every so many updates of the fine-tuning the policy is flown over validation episodes in the target (or
             what stands in for it), and `error` and `success` are added to the history: to see it work, at the price of
             flights that `samples` doesn't count. Nothing is chosen by them.
@@ -133,8 +140,11 @@ def adapt(
         keep: called with "transitions", "residual" and "policy" and the result, as soon as each exists.
 
     Raises:
-        InputError: when there is neither target nor transitions, or the transitions don't fit the policy's robot.
+        InputError: when there is neither target nor transitions, the transitions don't fit the policy's robot, or a
+            plant has other states or another control period, or gives nothing to learn from.
     """
+    if plant is not None:
+        target = flights_of(plant, policy, target, oracle)
     if METHODS[policy.method].pixels and (target is None or transitions is not None):
         raise InputError("adapt: a policy that sees pictures learns from them, and has to fly in the target to get any")
     if target is None and transitions is None:
@@ -145,7 +155,7 @@ def adapt(
     task, source = policy.task, Dynamics(policy.task.system)
     seen = seen or task
     device = next(policy.network.parameters()).device
-    tests = test_episodes(task).to(device)
+    tests = test_episodes(task, episodes).to(device)
     actor, footage, begun = policy.actor(seed), None, policy
     clock.next("evaluate")
     evaluations = {"source": evaluate(actor, source, task, tests)}
@@ -159,8 +169,7 @@ def adapt(
             begun, transitions, footage = _collected(
                 policy, target, seen, samples, rounds, exploration, seed, device, **settings
             )
-        unseen = task.episodes(20, "validation", seed).to(device)
-        held_out = collect(actor, tracking_env(target, seen, unseen, device=device), HELD_OUT)
+        held_out = _held_out(actor, target, seen, len(tests), seed, device)
     if transitions.context is not None:
         context = transitions.context.mean(0) if context is None else torch.as_tensor(context)
         if held_out is not None:
@@ -191,7 +200,19 @@ def adapt(
         clock.next("oracle")
         best, _ = finetune(begun, target, config, seed, progress, footage)
         evaluations["oracle"] = evaluate(best.actor(seed), target, seen, tests)
-    return Adaptation(tuned, residual, transitions, fit, evaluations, prediction, history, clock.stop(), best)
+    flights = None if plant is None else target.report()
+    return Adaptation(tuned, residual, transitions, fit, evaluations, prediction, history, clock.stop(), best, flights)
+
+
+def _held_out(actor, target, task, episodes, seed, device):
+    """Transitions of validation episodes, no more than the test episodes have; None of a plant that was lost."""
+    unseen = task.episodes(20, "validation", seed).to(device)
+    try:
+        return collect(actor, tracking_env(target, task, unseen, device=device), min(HELD_OUT, episodes * task.steps))
+    except InputError:
+        if getattr(target, "lost", False):
+            return None
+        raise
 
 
 def _collected(policy, target, task, samples, rounds, exploration, seed, device, *, kind, config, progress):
@@ -199,7 +220,12 @@ def _collected(policy, target, task, samples, rounds, exploration, seed, device,
     transitions = footage = None
     for number in range(rounds):
         share = samples * (number + 1) // rounds - samples * number // rounds
-        part, film = _flown(policy, target, task, share, exploration, seed + APART * number, device)
+        try:
+            part, film = _flown(policy, target, task, share, exploration, seed + APART * number, device)
+        except InputError:
+            if transitions is None or not getattr(target, "lost", False):
+                raise
+            break  # a plant was given up: what it flew before is kept
         transitions = part if transitions is None else joined((transitions, part))
         footage = film if footage is None else footage.joined(film)
         if number + 1 < rounds:

@@ -11,11 +11,19 @@ from typing import Annotated
 import tyro
 
 from adapt import command, report
+from adapt.setting import (
+    default_folder,
+    pick_setting,
+    recorded_only,
+    starting_policy,
+    target_text,
+    transitions_of,
+    with_plant,
+)
 from envs.errors import InputError
 
 RESULTS = ("config.json", "metrics.json", "policy.safetensors", "residual.safetensors", "transitions.csv", "tuning.csv")
 PICTURES = ("flight.png", "error.png", "residual.png", "training.png", "flight.mp4", "flight.gif")
-DEFAULT_TARGET = ("drag=0.3",)
 LOG_UPDATES = 600
 Repeatable = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
@@ -34,6 +42,9 @@ class Options:
     """Robot: cartpole, quadrotor or fixed_wing."""
     target: Repeatable = ()
     """What is different in the target, such as drag=0.3 or mass=x1.2; may be repeated (default: drag=0.3)."""
+    plant: str | None = None
+    """Fly a simulator or hardware instead of a target: rotorpy, drone-models, jsbsim, mujoco, or MODULE:FACTORY of your
+    own, called with the robot as modelled; it answers to reset and step."""
     policy: str | None = None
     """Checkpoint to start from (default: the one that ships for the robot)."""
     pixels: bool = False
@@ -51,6 +62,8 @@ class Options:
     updates: int | None = None
     """Gradient steps of the fine-tuning (default: 200; 600 with --log, as a real robot is farther from its model; 500
     with --pixels, and a third as many after each round but the last)."""
+    episodes: int | None = None
+    """Test episodes of each evaluation (default: 50; 30 for the fixed wing)."""
     oracle: bool = False
     """Also fine-tune in the true target, as a bound."""
     watch: int | None = None
@@ -84,22 +97,24 @@ class Options:
 
 def main(options):
     """Check the options, adapt, print, write."""
+    options = with_plant(options)
     _check(options)
     command.check_seed(options.seed)
     command.set_threads(options.threads)
     device = command.pick_device(options.device)
-    setting = _setting(options)
-    policy = _policy(options, setting)
-    recorded, validation = _recorded(options, setting)
+    setting = pick_setting(options)
+    policy = starting_policy(options, setting)
+    recorded, validation = transitions_of(options, setting)
     outputs = (*RESULTS, *PICTURES)
-    folder = command.output_folder(options.out or _default_folder(options), options.overwrite, outputs)
+    folder = command.output_folder(options.out or default_folder(options), options.overwrite, outputs)
     adaptation = _adapt(options, setting, policy, recorded, folder, device)
     _write_tuning(adaptation.history, folder / "tuning.csv")
     metrics = _metrics(options, policy, adaptation, validation)
     command.write_json(folder / "metrics.json", metrics)
     print(report.table(metrics))
     _pictures(options, adaptation, folder)
-    print(f"results in {folder}/: {', '.join(RESULTS[1:])}, pictures")
+    files = "metrics.json, policy.safetensors, residual.safetensors, transitions.csv, tuning.csv, pictures"
+    print(f"results in {folder}/: {files}")
 
 
 def _write_tuning(history, path):
@@ -112,10 +127,9 @@ def _write_tuning(history, path):
 
 
 def _check(options):
-    if options.watch is not None and options.watch < 1:
-        raise InputError(f"--watch {options.watch}: expected at least 1")
-    if options.updates is not None and options.updates < 1:
-        raise InputError(f"--updates {options.updates}: expected at least 1")
+    for name in ("watch", "updates", "episodes"):
+        if (number := getattr(options, name)) is not None and number < 1:
+            raise InputError(f"--{name} {number}: expected at least 1")
     if not 0 <= options.exploration <= 1:
         raise InputError(f"--exploration {options.exploration:g}: expected between 0 and 1")
     if options.oracle and options.transitions and not options.target:
@@ -131,6 +145,8 @@ def _check(options):
         raise InputError(f"--validate {both[0]}: is learned from with --log; give flights that are not")
     if options.pixels and (options.log or options.transitions):
         raise InputError("--pixels: learns from pictures, which logs and transitions don't hold; leave them out")
+    if options.plant and (options.target or options.oracle or options.log or options.pixels):
+        raise InputError("--plant: is the target, without equations; leave out --target, --oracle, --log, --pixels")
     if options.log and (options.target or options.oracle):
         raise InputError("--log: a recorded flight is the target; leave out --target and --oracle")
     from adapt.residual import AUTO, KINDS, MINIMUM
@@ -142,74 +158,6 @@ def _check(options):
         raise InputError(f"--rounds {options.rounds}: expected at least 1, and {least}")
     if options.samples < MINIMUM:
         raise InputError(f"--samples {options.samples}: a residual needs at least {MINIMUM} transitions")
-
-
-@dataclass(frozen=True)
-class Setting:
-    """The robot as modelled and, unless only logs tell of it, the target: how it differs, and its dynamics."""
-
-    system: object
-    vehicle: object | None
-    domain: object | None = None
-    target: object | None = None
-
-
-def _setting(options):
-    from envs.domains import parse_target
-    from envs.registry import make_dynamics
-
-    system, vehicle = command.pick_robot(options.system, options.vehicle)
-    if _recorded_only(options):
-        return Setting(system, vehicle)
-    domain = parse_target(options.target or DEFAULT_TARGET, system)
-    return Setting(system, vehicle, domain, make_dynamics(system, domain))
-
-
-def _policy(options, setting):
-    method = "apg-pixels" if options.pixels else "apg"
-    policy = command.pick_policy(options.policy, setting.system, setting.vehicle, method)
-    if options.set is not None:
-        policy = replace(policy, task=replace(policy.task, set=options.set))
-    if setting.domain is not None:
-        setting.domain.seen(policy.task)  # a changed picture means nothing to a policy that sees the state
-    policy.task.episodes(1, "train", 0)  # waypoints that can't be read or flown are told before anything is written
-    return policy
-
-
-def _recorded(options, setting):
-    """Transitions to learn from and to validate on, where the options name some."""
-    if options.transitions:
-        from adapt.residual import MINIMUM
-        from adapt.transitions import Transitions
-
-        return Transitions.load(options.transitions, setting.system, MINIMUM), None
-    if not options.log:
-        return None, None
-    recorded, validation = (_flights(paths, options, setting) for paths in (options.log, options.validate))
-    if validation is not None:
-        from adapt.prediction import prediction_report
-        from envs.dynamics import Dynamics
-
-        prediction_report(Dynamics(setting.system), validation)  # flights that are too short are told before the work
-    return recorded, validation
-
-
-def _flights(paths, options, setting):
-    from adapt.logs import flight_transitions, read_flight
-
-    if not paths:
-        return None
-    logs = [read_flight(path, setting.vehicle, options.mapping) for path in paths]
-    for log in logs:
-        print(log.report)
-    return flight_transitions(logs)
-
-
-def _default_folder(options):
-    robot = Path(options.vehicle).stem if options.vehicle else options.system
-    text = "-".join((robot, *(["pixels"] if options.pixels else []), *_target_text(options).split()))
-    text = "".join(c if c.isalnum() or c in "-_.=," else "-" for c in text)
-    return f"runs/fewshot-{text}-n{options.samples}-seed{options.seed}"
 
 
 def _adapt(options, setting, policy, recorded, folder, device):
@@ -237,6 +185,7 @@ def _adapt(options, setting, policy, recorded, folder, device):
         return adapt(
             policy,
             setting.target,
+            plant=setting.plant,
             samples=options.samples,
             transitions=recorded,
             kind=options.residual,
@@ -246,6 +195,7 @@ def _adapt(options, setting, policy, recorded, folder, device):
             config=replace(finetuning(policy), updates=updates),
             seen=setting.domain and setting.domain.seen(policy.task),
             oracle=options.oracle,
+            episodes=options.episodes,
             watch=options.watch,
             progress=partial(tqdm, desc="fine-tuning", unit="update"),
             stage=lambda name: print(f"{name} ...", flush=True),
@@ -266,7 +216,7 @@ def _metrics(options, policy, adaptation, validation):
     metrics = {
         "system": options.vehicle or task.system.name,
         "set": task.set,
-        "target": _target_text(options),
+        "target": target_text(options),
         "method": policy.method,
         "metric": task.metric,
         "unit": task.unit,
@@ -279,7 +229,9 @@ def _metrics(options, policy, adaptation, validation):
         "seconds": adaptation.seconds,
         "threads": options.threads,
     }
-    if _recorded_only(options):
+    if adaptation.flights:
+        metrics["plant"] = adaptation.flights
+    if recorded_only(options):
         metrics["evaluated_in"] = "model + residual"
     if validation is not None:
         from adapt.prediction import prediction_report
@@ -305,18 +257,6 @@ def _found(fit):
         else {}
     )
     return said | ({"parameters": values, "alike": fit.alike} if fit.kind == "parameters" else {})
-
-
-def _recorded_only(options):
-    """Whether the target is known by its recorded transitions alone, so that nothing can be flown in it."""
-    return bool(options.log or (options.transitions and not options.target))
-
-
-def _target_text(options):
-    if _recorded_only(options):
-        first, *more = options.log or (options.transitions,)
-        return Path(first).name + (f" and {len(more)} more" if more else "")
-    return " ".join(options.target or DEFAULT_TARGET)
 
 
 def _pictures(options, adaptation, folder):

@@ -14,7 +14,8 @@ def collect(policy, env, n, exploration=0.0, generator=None):
     """Fly a policy in a target until `n` transitions are recorded; no gradient.
 
     Whole trajectories count one after another, the last one as far as it is needed: 1000 are ten flights of 100 steps,
-    30 are the beginning of one. What follows the end of an episode isn't used.
+    30 are the beginning of one. What follows the end of an episode isn't used. A target that is `one_at_a_time`, as a
+    plant is, flies the same episodes with the same noise one after another; if it is lost, fewer are recorded.
 
     Args:
         policy: TensorDict module that reads `observation` and `window` and writes `action`.
@@ -36,35 +37,65 @@ def collect(policy, env, n, exploration=0.0, generator=None):
         env = tracking_env(*env)
     generator = generator or torch.Generator().manual_seed(0)
     flights, missing, queue = [], n, []
-    while missing > 0:
+    while missing > 0 and not getattr(env.dynamics, "lost", False):
         count = math.ceil(missing / env.task.steps)
         while len(queue) < count:
             queue.extend(torch.randperm(len(env.episodes), generator=generator).tolist())
-        flown = _fly(policy, env, queue[:count], min(missing, env.task.steps), exploration, generator)
+        size = (count, len(env.dynamics.system.Action._fields))
+        noise = Noise(size, exploration, generator)
+        flown = _fly(policy, env, queue[:count], min(missing, env.task.steps), noise)
         queue = queue[count:]
-        if not any(len(state) for state, _, _ in flown):
+        if not any(len(state) for state, _, _ in flown) and not hasattr(env.dynamics, "lost"):
             raise InputError(
                 "collect: every flight failed at once; the policy or the target gives numbers that aren't finite"
             )
         for flight in flown:
             flights.append(tuple(part[:missing] for part in flight))
             missing -= len(flights[-1][0])
+    if not any(len(state) for state, _, _ in flights):
+        first = next(iter(env.dynamics.report()["faults"]), "it was given up before")
+        raise InputError(f"{env.dynamics.name}: no flight got past its first step ({first}); nothing to learn from")
     return _joined([flight for flight in flights if len(flight[0])], env.dynamics.system)
 
 
+class Noise:
+    """Exploration noise of flights: drawn step by step for all, so that each gets the same in whatever order they fly.
+
+    Args:
+        size: (flights, entries of an action).
+        deviation: its standard deviation.
+    """
+
+    def __init__(self, size, deviation, generator):
+        self.size, self.deviation, self.generator, self.drawn = size, deviation, generator, []
+
+    def __call__(self, step, flights):
+        """The noise (k, m) of k flights at a step."""
+        while len(self.drawn) <= step:
+            self.drawn.append(self.deviation * torch.randn(self.size, generator=self.generator))
+        return self.drawn[step][flights]
+
+
+def _fly(policy, env, episodes, steps, noise):
+    """Fly episodes: for each, (state, action, next_state) up to its end."""
+    rows = list(range(len(episodes)))
+    together = [[row] for row in rows] if getattr(env.dynamics, "one_at_a_time", False) else [rows]
+    return [flight for some in together for flight in _fly_together(policy, env, episodes, steps, noise, some)]
+
+
 @torch.no_grad()
-def _fly(policy, env, episodes, steps, exploration, generator):
-    """Fly episodes side by side: for each, (state, action, next_state) up to its end."""
+def _fly_together(policy, env, episodes, steps, noise, flights):
+    """The same for some of the flights, side by side."""
     from tensordict import TensorDict
     from torchrl.envs.utils import step_mdp
 
+    episodes = [episodes[flight] for flight in flights]
     start = TensorDict({"episode": torch.tensor(episodes).unsqueeze(-1)}, batch_size=len(episodes), device=env.device)
     now, record = env.reset(start, set_state=True), []
     flying = torch.ones(len(episodes), dtype=torch.bool)
-    for _ in range(steps):
+    for step in range(steps):
         now = policy(now)
-        noise = exploration * torch.randn(now["action"].shape, generator=generator).to(now["action"])
-        now["action"] = (now["action"] + noise).clamp(-1, 1)
+        now["action"] = (now["action"] + noise(step, flights).to(now["action"])).clamp(-1, 1)
         now = env.step(now)
         rows = tuple(part.cpu() for part in (now["state"], now["action"], now["next", "state"]))
         flying = flying & torch.cat(rows, -1).isfinite().all(-1)

@@ -53,6 +53,17 @@ def parameter_table(residual):
 
 def notes(metrics):
     """What a user should not overlook in the numbers."""
+    return [*_broken_flights(metrics.get("plant")), *_worth(metrics)]
+
+
+def _broken_flights(plant):
+    if not plant or not plant["broken"]:
+        return []
+    lost = "; then it was given up" if plant["given up"] else ""
+    return [f"{plant['broken']} of {plant['flights']} flights of the plant broke off ({plant['faults'][0]}){lost}"]
+
+
+def _worth(metrics):
     source, before, after = (metrics[name] for name in ("source", "zero_shot", "few_shot"))
     if not source["success"]:
         return ["no flight succeeded even in the model; can this reference be flown by this robot?"]

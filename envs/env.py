@@ -26,7 +26,8 @@ class TrackingEnv(EnvBase):
     episodes belong to the environment, so a partial reset can't lose them. Gradients flow through `rollout`.
 
     Args:
-        dynamics: anything that maps (..., n), (..., m) to (..., n) and has `.system`.
+        dynamics: anything that maps (..., n), (..., m) to (..., n) and has `.system`. Where it has `begin`, every start
+            is passed to it, and a flight begins at the state that it returns.
         episodes: (N, ...) rows as `task.episodes` draws them. May be exchanged for as many others while it runs.
         anywhere: begin drawn episodes at random steps of their references instead of the first.
         threshold: distance from the reference (`task.distance`) beyond which an episode is cut off; None: no limit.
@@ -93,6 +94,8 @@ class TrackingEnv(EnvBase):
         state = self._started(episode, step)
         if self.anywhere:
             step, state = self._moved_on(episode, step, state)
+        if hasattr(self.dynamics, "begin"):
+            state = self.dynamics.begin(state)
         return self._described(state, episode, step)
 
     def _started(self, episode, step):

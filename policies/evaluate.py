@@ -50,11 +50,25 @@ def evaluate(actor, dynamics, task, episodes, progress=None):
     """Fly every row of `episodes` once from its start with a TensorDict policy; deterministic.
 
     States behind the end of an episode repeat the last one. The policy is still called on such a row while others fly,
-    with `done` set, so that a planner can leave it out; when all have ended, so does the evaluation.
+    with `done` set, so that a planner can leave it out; when all have ended, so does the evaluation. Dynamics that are
+    `one_at_a_time`, as a plant is, fly the episodes one after another.
 
     Args:
-        progress: wraps the iterable of steps, as `tqdm` does.
+        progress: wraps the iterable of steps, or of flights one at a time, as `tqdm` does.
     """
+    if getattr(dynamics, "one_at_a_time", False):
+        rows = range(len(episodes))
+        flights = [_flown(actor, dynamics, task, episodes[i : i + 1]) for i in (progress(rows) if progress else rows)]
+        states, actions = (torch.cat(parts) for parts in zip(*flights, strict=True))
+    else:
+        states, actions = _flown(actor, dynamics, task, episodes, progress)
+    error, success = task.score(episodes, states)
+    table = {"episode": range(len(episodes)), "error": error.cpu().numpy(), "success": success.cpu().numpy()}
+    return Evaluation(pd.DataFrame(table), task.metric, task.unit, states, actions, episodes)
+
+
+def _flown(actor, dynamics, task, episodes, progress=None):
+    """States (N, steps + 1, n) and actions (N, steps, m) of episodes flown side by side."""
     env = tracking_env(dynamics, task, episodes, batch_size=(len(episodes),), device=episodes.device)
     rows = torch.arange(len(episodes), device=episodes.device).unsqueeze(-1)
     now = env.reset(TensorDict({"episode": rows}, batch_size=env.batch_size), set_state=True)
@@ -71,9 +85,7 @@ def evaluate(actor, dynamics, task, episodes, progress=None):
     missing = task.steps - len(actions)
     states = torch.stack(states + missing * states[-1:], 1)
     actions += missing * [torch.zeros_like(actions[-1])]
-    error, success = task.score(episodes, states)
-    table = {"episode": range(len(episodes)), "error": error.cpu().numpy(), "success": success.cpu().numpy()}
-    return Evaluation(pd.DataFrame(table), task.metric, task.unit, states, torch.stack(actions, 1), episodes)
+    return states, torch.stack(actions, 1)
 
 
 def test_episodes(task, n=None, split="test", seed=0):

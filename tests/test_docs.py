@@ -28,7 +28,9 @@ def documented(page):
 
 def option_classes(module):
     """Classes that hold the options of a command; several if it has subcommands, none if the module is no command."""
-    tree = ast.parse((ROOT / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8"))
+    file = ROOT / f"{module.replace('.', '/')}.py"
+    file = file if file.exists() else file.with_suffix("") / "__init__.py"
+    tree = ast.parse(file.read_text(encoding="utf-8"))
     if not any(isinstance(node, ast.If) and "__main__" in ast.unparse(node.test) for node in tree.body):
         return set()
     classes = {node.name for node in tree.body if isinstance(node, ast.ClassDef)}

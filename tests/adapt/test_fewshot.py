@@ -207,7 +207,7 @@ def test_the_folder_is_named_after_the_run(call, cart, tmp_path, monkeypatch):
         (("--updates", "0"), "--updates 0"),
         (("--exploration", "-1"), "--exploration -1"),
         (("--exploration", "nan"), "--exploration nan"),
-        (("--residual", "jerk"), "--residual jerk: expected one of acceleration, state"),
+        (("--residual", "jerk"), "--residual jerk: expected one of auto, parameters"),
         (("--system", "submarine"), "--system submarine"),
         (("--target", "gravitas=1"), "--target gravitas=1: cartpole has no 'gravitas'"),
         (("--target", "pole_mass=-1"), "pole_mass is -1"),
