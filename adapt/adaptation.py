@@ -45,8 +45,13 @@ class Adaptation:
 
 def finetuning(policy):
     """The settings that a policy is fine-tuned with unless others are asked for."""
-    method = METHODS[policy.method].module
-    return method.finetuning(method.PRESETS.get(policy.task.system.name, method.Config()))
+    return usual_finetuning(policy.method, policy.task.system)
+
+
+def usual_finetuning(method, system):
+    """The same for what a method, by name, has trained for a system."""
+    module = METHODS[method].module
+    return module.finetuning(module.PRESETS.get(system.name, module.Config()))
 
 
 def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None, judge=None):

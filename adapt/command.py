@@ -212,6 +212,12 @@ def terminated_as_interrupted():
         signal.signal(signal.SIGTERM, before)
 
 
+def flags(name, value):
+    """An option as it is typed, in words: by its name alone if it is switched on, again for each of several values."""
+    flag = f"--{name.replace('_', '-')}"
+    return [flag] if value is True else [f"{flag} {part}" for part in (value if isinstance(value, tuple) else (value,))]
+
+
 def check_seed(seed):
     """Refuse a seed that generators can't take.
 

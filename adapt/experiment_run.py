@@ -110,6 +110,7 @@ def _settings(step):
     Options that are off don't count, so that a new one of a command changes no hash.
     """
     from adapt import pretrain
+    from adapt.adaptation import usual_finetuning
     from envs import make_system, make_task
     from envs.camera import Camera
     from policies import METHODS, pixel_mpc
@@ -124,8 +125,7 @@ def _settings(step):
     if step.command == "adapt.pretrain":
         yield repr(pretrain.configuration(given, system))
     elif step.command == "adapt.fewshot":
-        module = METHODS[method].module
-        yield repr(module.finetuning(module.PRESETS.get(system.name, module.Config())))
+        yield repr(usual_finetuning(method, system))
     elif step.command == "adapt.vision":
         yield repr(Camera())
         yield repr((METHODS[f"{method}-pixels"].module if method != "mpc" else pixel_mpc).Config())

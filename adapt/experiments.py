@@ -145,9 +145,7 @@ def said(step, name, root="runs/experiments", seed=0):
 
     words = [f"python -m {step.command}"]
     for key, value in resolved(step, Path(root), seed, name).items():
-        flag = f"--{key.replace('_', '-')}"
-        values = value if isinstance(value, tuple) else (value,)
-        words += [flag] if value is True else [f"{flag} {part}" for part in values]
+        words += command.flags(key, value)
     return " ".join([*words, f"--out {place(root, name, seed) / step.out}"])
 
 

@@ -251,11 +251,8 @@ def _found(fit):
     """What was learned, for people."""
     said = {"kind": fit.kind, "inputs": fit.inputs, "network": fit.network, "warnings": fit.warnings}
     values = {name: {"value": value, "standard_error": error} for name, (value, error) in fit.parameters.items()}
-    said |= (
-        {"tried": {one.kind: one.score if one.shares is not None else one.why for one in fit.tried}}
-        if fit.tried
-        else {}
-    )
+    if fit.tried:
+        said["tried"] = {one.kind: one.score if one.shares is not None else one.why for one in fit.tried}
     return said | ({"parameters": values, "alike": fit.alike} if fit.kind == "parameters" else {})
 
 
@@ -263,13 +260,11 @@ def _pictures(options, adaptation, folder):
     from adapt.plots import draw_all
 
     draw_all(adaptation, folder)
-    if options.video:
+    if options.video or options.gif:
         from adapt.video import write_video
-
+    if options.video:
         write_video(adaptation, folder / "flight.mp4")
     if options.gif:
-        from adapt.video import write_video
-
         write_video(adaptation, folder / "flight.gif", fps=12.5)
 
 

@@ -186,10 +186,8 @@ def settle(loss, names, start):
         values = {name: values[name] + float(c * s) for name, c, s in zip(names, change, sizes, strict=True)}
         if change.abs().max() < SETTLED:
             break
-    noise = getattr(loss, "noise", None)
-    return Found(
-        values, dict(zip(names, errors.tolist(), strict=True)), {}, tuple(noise.tolist()) if noise is not None else ()
-    )
+    noise = () if loss.noise is None else tuple(loss.noise.tolist())
+    return Found(values, dict(zip(names, errors.tolist(), strict=True)), noise=noise)
 
 
 def _standard_errors(left, effects):

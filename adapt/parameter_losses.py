@@ -49,6 +49,8 @@ def central(evaluate, base, values, name):
 class OneStep:
     """Accelerations over one control period. Residuals are in rows of transitions, outputs side by side."""
 
+    noise = None  # none is estimated
+
     def __init__(self, base, data):
         self.base, self.data = base, data
         self.rows = [data.state_names.index(name) for name in base.system.accelerations]

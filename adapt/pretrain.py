@@ -225,9 +225,7 @@ def said(options):
     for item in fields(options):
         value = getattr(options, item.name)
         if (value != item.default or item.name in ("system", "seed")) and item.name not in UNNAMED:
-            flag = f"--{item.name.replace('_', '-')}"
-            values = value if isinstance(value, tuple) else (value,)
-            words += [flag] if value is True else [f"{flag} {part}" for part in values]
+            words += command.flags(item.name, value)
     return " ".join(words)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from adapt import command
+from adapt import command, training, training_log
 from envs import make_dynamics, make_task
 from policies import apg
 from policies.checkpoints import Policy, save_policy
@@ -16,6 +16,16 @@ ROUGH = {
     "cartpole": apg.APGConfig(updates=120, batch=32, width=32, learning_rate=2e-2, curriculum=0.3, episodes=50),
     "quadrotor": apg.APGConfig(updates=100, batch=64, width=32, learning_rate=2e-2, curriculum=0.3, episodes=50),
 }
+
+
+@pytest.fixture
+def few_validations(monkeypatch):
+    """Few short validations, and no TensorBoard files where it happens to be installed."""
+    whole = training.validate
+    monkeypatch.setattr(
+        training, "validate", lambda actor, dynamics, task, n: whole(actor, dynamics, replace(task, steps=20), n=3)
+    )
+    monkeypatch.setattr(training_log, "_tensorboard", lambda folder: None)
 
 
 @dataclass(frozen=True)

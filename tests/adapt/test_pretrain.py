@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from adapt import pretrain, training, training_log
+from adapt import pretrain, training
 from envs import make_dynamics, make_system
 from policies import apg, evaluate
 from policies.checkpoints import load_policy
@@ -21,16 +21,7 @@ from policies.networks import as_actor, network_for
 ROOT = Path(__file__).parents[2]
 TINY = ("--system", "cartpole", "--updates", 12, "--every", 4, "--batch", 4, "--width", 8)
 FILES = {"config.json", "log.csv", "policy.safetensors", "training.pt"}
-
-
-@pytest.fixture(autouse=True)
-def few_validations(monkeypatch):
-    """Few short validations, and no TensorBoard files where it happens to be installed."""
-    whole = training.validate
-    monkeypatch.setattr(
-        training, "validate", lambda actor, dynamics, task, n: whole(actor, dynamics, replace(task, steps=20), n=3)
-    )
-    monkeypatch.setattr(training_log, "_tensorboard", lambda folder: None)
+pytestmark = pytest.mark.usefixtures("few_validations")
 
 
 def rows(folder):

@@ -6,21 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from adapt import training, training_log
+from adapt import training
 from envs import make_system
 from policies.checkpoints import load_policy
 
 TINY = ("--system", "cartpole", "--updates", 4, "--every", 2, "--batch", 4, "--width", 8)
-
-
-@pytest.fixture(autouse=True)
-def few_validations(monkeypatch):
-    """Few short validations, and no TensorBoard files where it happens to be installed."""
-    whole = training.validate
-    monkeypatch.setattr(
-        training, "validate", lambda actor, dynamics, task, n: whole(actor, dynamics, replace(task, steps=10), n=2)
-    )
-    monkeypatch.setattr(training_log, "_tensorboard", lambda folder: None)
+pytestmark = pytest.mark.usefixtures("few_validations")
 
 
 def trained(call, folder, *options):
