@@ -118,7 +118,8 @@ def test_the_same_seed_adapts_the_same_way_and_another_does_not(rough_cartpole, 
     few = {"samples": 30, "config": replace(QUICK, updates=3)}
     one, two, other = (adapt(rough_cartpole, target, seed=seed, **few) for seed in (0, 0, 1))
     assert torch.equal(one.transitions.state, two.transitions.state)
-    assert one.history == two.history
+    first, second = ([{**row, "seconds": None} for row in result.history] for result in (one, two))
+    assert first == second
     assert one.evaluations["few_shot"].table.equals(two.evaluations["few_shot"].table)
     assert not torch.equal(one.transitions.state, other.transitions.state)
 

@@ -256,7 +256,7 @@ def test_adaptation_to_a_plant_is_adaptation_to_its_equations(rough_cartpole, ta
         mine, other = (result.evaluations[name].summary for result in (ours, theirs))
         assert other["mean"] == pytest.approx(mine["mean"], rel=0.05)
         assert other["n"] == mine["n"] == 10
-    assert theirs.evaluations["few_shot"].summary["mean"] < 0.5 * theirs.evaluations["zero_shot"].summary["mean"]
+    assert theirs.evaluations["few_shot"].summary["mean"] < 0.7 * theirs.evaluations["zero_shot"].summary["mean"]
     assert ours.flights is None
     assert theirs.flights["broken"] == 0
 
