@@ -11,12 +11,13 @@ from dataclasses import dataclass
 
 import torch
 
+from adapt.sensitivities import apart, of_start, step_slopes
 from adapt.sparse_ridge import blocks
 from adapt.stretches import cut, difference
 from envs.errors import InputError
 
 FOLDS = 3
-AHEAD = 5  # control periods that are predicted
+AHEAD = 10  # control periods that are predicted
 SOLVED = 1e-3  # [-] share of the model's error that needs no better kind
 EQUAL = 0.02  # [-] difference of shares that isn't worth a more complex kind
 MOTION = 1e-3  # [-] share of the motion below which an error doesn't matter
@@ -89,11 +90,17 @@ def left_over(residual, base, data):
     """The share (S,) of the model's squared error that a residual leaves of each stretch, averaged over its states.
 
     A state counts by the error of the model over all stretches, so that each has the same weight; one that the model
-    predicts well compared with how it moves doesn't matter.
+    predicts well compared with how it moves doesn't matter. What another state at the beginning of the stretch would
+    explain isn't counted: states are measured, and a residual that takes their noise for motion predicts the next
+    measurement well, and flight badly.
     """
-    flown = cut(data, AHEAD)
+    flown, system = cut(data, AHEAD), base.system
     start = flown.measured[:, 0]
-    squares = [flown.missed(flown.seen_by(one), start)[:, 1:].square().mean(1) for one in (residual, base)]  # (S, d)
-    moved = difference(base.system, flown.measured[:, :1], flown.measured[:, 1:]).square().mean((0, 1))
-    weights = 1 / torch.maximum(squares[1].mean(0), MOTION**2 * moved).clamp(min=1e-18)
-    return (squares[0] * weights).mean(-1)
+    paths = [flown.predicted(flown.seen_by(one), start) for one in (residual, base)]
+    left, before = (flown.missed(system, path) for path in paths)
+    moved = difference(system, flown.measured[:, :1], flown.measured[:, 1:]).square().mean((0, 1))
+    scale = torch.maximum(before.square().mean((0, 1)), MOTION**2 * moved).clamp(min=1e-18).sqrt()
+    slopes = step_slopes(base, paths[1][:, :-1], flown.action)
+    parts = (torch.stack((left, before), -1) / scale[:, None]).flatten(1, 2)  # (S, (T + 1) d, 2)
+    rest = apart(parts, (of_start(slopes) / scale[:, None]).flatten(1, 2)).square().mean(1)
+    return rest[:, 0] / rest[:, 1].mean().clamp(min=1e-18)

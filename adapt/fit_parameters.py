@@ -13,6 +13,7 @@ import torch
 from adapt.parameter_losses import NEGLIGIBLE, OneStep, Shooting, size
 from adapt.parameter_residual import candidates, changed, nominal
 from adapt.prediction import prediction_error
+from adapt.sensitivities import apart
 from envs.errors import InputError
 
 MOST = 8  # parameters
@@ -84,7 +85,7 @@ def _chosen(loss):
         names = [name for name in candidates(system) if name not in found.values]
         left, effects = loss.linearised(found.values, (*found.values, *names))
         own, others = effects[:, : len(found.values)], effects[:, len(found.values) :]
-        others, left = _apart(others, own), _apart(left[:, None], own)[:, 0]
+        others, left = apart(others, own), apart(left[:, None], own)[:, 0]
         best = _next(names, others, left)
         folds = loss.folds.repeat_interleave(len(left) // len(loss.folds))
         if best is None or not _predicts(left, others[:, names.index(best)], folds):
@@ -130,14 +131,6 @@ def undetermined(effects, names):
     parts = directions[-1] / norms
     parts = (parts / parts.abs().max()).tolist()
     return " with ".join(f"{value:+.2g} {name}" for name, value in zip(names, parts, strict=True) if abs(value) > 0.01)
-
-
-def _apart(vectors, basis):
-    """The part of the columns of `vectors` that no combination of the columns of `basis` makes."""
-    if not basis.shape[1]:
-        return vectors
-    q, _ = torch.linalg.qr(basis)
-    return vectors - q @ (q.T @ vectors)
 
 
 def _next(names, effects, left):

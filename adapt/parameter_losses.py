@@ -14,11 +14,12 @@ import torch
 
 from adapt.parameter_residual import changed, nominal
 from adapt.prediction import predict
+from adapt.sensitivities import apart, of_kicks, of_start, step_slopes
 from adapt.sparse_ridge import blocks
 from adapt.stretches import cut, difference, displaced
 from envs.errors import InputError
 
-STEP = 1e-4  # [-] of a parameter's size, or of a state, for central differences
+STEP = 1e-4  # [-] of a parameter's size, for central differences
 SIZE = 0.1  # smallest size that a parameter is taken to have, in its own unit
 NEGLIGIBLE = 1e-4  # [m/s^2, rad/s^2] what needs no explanation
 LENGTH = 10  # control periods of a stretch
@@ -67,7 +68,7 @@ class OneStep:
         spread = left.square().mean(0).sqrt()
         weights = 1 / spread.clamp(min=max(NEGLIGIBLE, 1e-3 * float(spread.max())))
         effects = [-(central(self.missed, self.base, values, name) * weights).flatten() for name in names]
-        return (left * weights).flatten(), _columns(effects, left.numel())
+        return (left * weights).flatten(), torch.stack(effects, -1) if names else left.new_zeros(left.numel(), 0)
 
 
 class Shooting:
@@ -87,41 +88,36 @@ class Shooting:
     @torch.no_grad()
     def linearised(self, values, names):
         """See `OneStep`; the initial states are estimated anew for the given values."""
-        dynamics = changed(self.base, values)
+        dynamics, system = changed(self.base, values), self.base.system
+        path = self.flown.predicted(dynamics, self.start)
+        slopes = step_slopes(dynamics, path[:, :-1], self.flown.action)
+        inner = of_start(slopes)
         for _ in range(SETTLING):
-            left, inner = self.flown.missed(dynamics, self.start), self._inner(dynamics)
+            left = self.flown.missed(system, path)
             if self._estimate_noise(left):
                 break
-            change = torch.linalg.lstsq(
-                inner / self._scale(left), (left / self.noise).flatten(1).unsqueeze(-1)
-            ).solution
-            self.start = displaced(self.base.system, self.start, change.squeeze(-1))
-        basis, _ = torch.linalg.qr(inner / self._scale(left))
-        effects = [-central(lambda d: self.flown.missed(d, self.start), self.base, values, name) for name in names]
-        rest = [self._apart(part, basis) for part in (left, *effects)]
-        return rest[0].flatten(), _columns([part.flatten() for part in rest[1:]], rest[0].numel())
+            change = torch.linalg.lstsq(self._scaled(inner), self._scaled(left[..., None])).solution
+            self.start = displaced(system, self.start, change.squeeze(-1))
+            path = self.flown.predicted(dynamics, self.start)
+        parts = torch.cat((left[..., None], of_kicks(slopes, self._kicks(path, values, names))), -1)
+        rest = apart(self._scaled(parts), self._scaled(inner)).flatten(0, 1)
+        return rest[:, 0], rest[:, 1:]
 
-    def _inner(self, dynamics):
-        """The effects (M, (T + 1) d, d) of the initial states: central differences, all directions in one batch."""
-        dimensions = len(difference(self.base.system, self.start[:1], self.start[:1])[0])
-        steps = STEP * torch.eye(dimensions, dtype=self.start.dtype)
-        ends = [displaced(self.base.system, self.start, sign * steps[:, None]) for sign in (1, -1)]
-        ahead, behind = (self.flown.missed(dynamics, end) for end in ends)  # (d, M, T + 1, d)
-        return -((ahead - behind) / (2 * STEP)).flatten(2).permute(1, 2, 0)
+    def _kicks(self, path, values, names):
+        """What a change of each parameter, in its size, adds to every step of the path: (M, T, d, p)."""
+        before, after = path[:, :-1], path[:, 1:]
+
+        def step(dynamics):
+            return difference(dynamics.system, after, dynamics(before, self.flown.action))
+
+        kicks = [central(step, self.base, values, name) for name in names]
+        return torch.stack(kicks, -1) if names else before.new_zeros(*before.shape[:2], len(self.noise), 0)
 
     def _estimate_noise(self, left):
         """Take the noise from what is left; whether it is as it was."""
         before, self.noise = self.noise, left.square().mean((0, 1)).sqrt().clamp(min=FLOOR)
         return before is not None and bool(((self.noise - before).abs() < SETTLED * before).all())
 
-    def _scale(self, left):
-        return self.noise.repeat(left.shape[1])[:, None]
-
-    def _apart(self, left, basis):
-        """What no initial state explains of residuals, in units of the noise: (M, (T + 1) d)."""
-        flat = (left / self.noise).flatten(1).unsqueeze(-1)
-        return (flat - basis @ (basis.mT @ flat)).squeeze(-1)
-
-
-def _columns(parts, rows):
-    return torch.stack(parts, -1) if parts else torch.zeros(rows, 0, dtype=torch.float64)
+    def _scaled(self, parts):
+        """Changes (M, T + 1, d, c) in units of the noise, as the rows (M, (T + 1) d, c) of each stretch."""
+        return (parts / self.noise[:, None]).flatten(1, 2)

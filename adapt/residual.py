@@ -134,8 +134,20 @@ def fit_residual(transitions, base, kind="acceleration", seed=0, settings=FitSet
 def _chosen(data, base, seed, settings, began):
     """The kind that predicts best, fitted to all data; its report says what was tried."""
     _check_prediction(base, data)
-    tried, kind = choose(data, base, MENU, lambda part, kind: fit_residual(part, base, kind, seed, settings)[0])
-    residual, report = fit_residual(data, base, kind, seed, settings)
+
+    def fit(part, kind, names=()):
+        return fit_residual(part, base, kind, seed, settings, names)
+
+    named = fit(data, "parameters")
+    names = named[0].config.parameters  # searched for once; each fold fits their values anew
+
+    def held_out_fit(part, kind):
+        if kind == "parameters":
+            return fit(part, kind, names)[0] if names else base
+        return fit(part, kind)[0]
+
+    tried, kind = choose(data, base, MENU, held_out_fit)
+    residual, report = named if kind == "parameters" else fit(data, kind)
     return residual, replace(report, tried=tried, seconds=time.perf_counter() - began)
 
 

@@ -22,16 +22,16 @@ class Stretches:
         names = getattr(getattr(dynamics, "config", None), "context_names", ())
         return dynamics.with_context(self.context) if names else dynamics
 
-    def missed(self, dynamics, start):
-        """What leads (…, M, T + 1, d) from predicted to measured states, in the tangent space.
-
-        Args:
-            start: (…, M, n) that predictions begin in.
-        """
-        predicted = [start]
+    def predicted(self, dynamics, start):
+        """The states (M, T + 1, n) that the recorded actions lead to from `start` (M, n)."""
+        states = [start]
         for action in self.action.unbind(1):
-            predicted.append(dynamics(predicted[-1], action.expand(*start.shape[:-1], -1)))
-        return difference(dynamics.system, torch.stack(predicted, -2), self.measured)
+            states.append(dynamics(states[-1], action))
+        return torch.stack(states, 1)
+
+    def missed(self, system, predicted):
+        """What leads (M, T + 1, d) from predicted to measured states, in the tangent space."""
+        return difference(system, predicted, self.measured)
 
 
 def cut(data, length):

@@ -1,11 +1,15 @@
 """The kind of residual is chosen by the flight that it predicts, the simplest of equals."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from adapt import collect
 from adapt.choose_residual import Tried, choose, left_over, simplest
+from adapt.prediction import prediction_error
 from adapt.residual import MENU, fit_residual
+from adapt.stretches import displaced
 from envs import make_dynamics
 from envs.errors import InputError
 from policies.checkpoints import load_policy
@@ -28,9 +32,29 @@ def test_the_model_leaves_everything_and_the_truth_nothing(data):
     base, truth = make_dynamics("quadrotor"), make_dynamics("quadrotor", TARGET)
     half = make_dynamics("quadrotor", "drag=0.15")
     all_of_it, none, a_quarter = (float(left_over(one, base, fit_double(data)).mean()) for one in (base, truth, half))
-    assert all_of_it == pytest.approx(1.0, abs=0.5)
+    assert all_of_it == pytest.approx(1.0)
     assert none < 1e-6
-    assert a_quarter == pytest.approx(all_of_it / 4, rel=0.1)
+    assert a_quarter == pytest.approx(0.25, rel=0.2)  # over a second, a drag's effect is not quite proportional to it
+
+
+def test_what_predicts_the_next_measurement_by_filtering_noise_is_no_better_than_the_truth(data):
+    """Under noise a yaw rate seems to decay faster than it does: a gain that isn't there predicts it."""
+    seen, base = measured(fit_double(data)), make_dynamics("quadrotor")
+    filtering, truth = (make_dynamics("quadrotor", target) for target in (f"{TARGET} rate_gain_z=8", TARGET))
+    assert prediction_error(filtering, seen)["rates"] < prediction_error(truth, seen)["rates"]
+    assert float(left_over(filtering, base, seen).mean()) > float(left_over(truth, base, seen).mean())
+
+
+def measured(data):
+    """The same with errors of 1 mm, 0.5 deg, 0.02 m/s, 0.05 rad/s; a state is measured once."""
+    deviations = torch.tensor([0.001] * 3 + [0.0087] * 3 + [0.02] * 3 + [0.05] * 3, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    errors = deviations * torch.randn(len(data) + 1, 12, generator=generator, dtype=torch.float64)
+    system = make_dynamics("quadrotor").system
+    states = [
+        displaced(system, part, error) for part, error in ((data.state, errors[:-1]), (data.next_state, errors[1:]))
+    ]
+    return replace(data, state=states[0], next_state=states[1])
 
 
 def fit_double(data):
