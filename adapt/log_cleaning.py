@@ -5,6 +5,8 @@ import numpy as np
 from envs.errors import InputError
 
 REASONS = (
+    "no message near enough",
+    "not valid by its own flags",
     "not a number",
     "time stands still",
     "time jumps",
@@ -40,6 +42,7 @@ def reject(rows, vehicle, step_limit):
         norm = np.linalg.norm(rows.attitude, axis=1)
         sensors, motors = vehicle.sensors, vehicle.motors
         nowhere = np.zeros(len(steps), bool)
+        missed, flagged = (nowhere if doubt is None else doubt for doubt in (rows.missed, rows.flagged))
         if rows.motors is None or motors is None:
             motors_out = nowhere
         else:
@@ -47,6 +50,8 @@ def reject(rows, vehicle, step_limit):
         thrust_out = (rows.thrust < 0) | (rows.thrust > 2 * vehicle.system.thrust_max)
         voltage = rows.voltage
         found = (
+            missed,
+            flagged,
             ~np.all([np.isfinite(v).reshape(len(v), -1).all(1) for v in rows if v is not None], axis=0),
             steps <= 0,
             steps > step_limit,

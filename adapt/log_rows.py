@@ -20,6 +20,8 @@ class Rows(NamedTuple):
     motors: np.ndarray | None  # [-] (N, k) commands
     rate_commands: np.ndarray | None  # [rad/s] (N, 3) body
     voltage: np.ndarray | None  # [V] (N,)
+    missed: np.ndarray | None = None  # (N,) bool, another topic of the log had no message near enough
+    flagged: np.ndarray | None = None  # (N,) bool, a column that the mapping requires has another value
 
     def take(self, rows):
         """The same with the given rows only."""
@@ -68,7 +70,22 @@ def convert(table, mapping, vehicle, log):
         motors=values.get("motors"),
         rate_commands=values.get("rate_commands"),
         voltage=values["voltage"][:, 0] if "voltage" in values else None,
+        flagged=_flagged(table, mapping, log),
     )
+
+
+def _flagged(table, mapping, log):
+    """Rows whose columns don't have the values that the mapping requires: (N,) bool, or None if it requires none."""
+    flagged = None
+    for column, good in mapping.require.items():
+        wrong = ~table[column].isin(good).to_numpy()
+        if wrong.all():
+            values = table[column].dropna().unique()[:3]
+            found = ", ".join(f"{one:g}" if isinstance(one, float) else str(one) for one in values) or "empty"
+            wanted = " or ".join(str(value) for value in good)
+            raise InputError(f"{log}: {column} is {found} in all rows, mapping {mapping.name} requires {wanted}")
+        flagged = wrong if flagged is None else flagged | wrong
+    return flagged
 
 
 def _numbers(table, quantity, log):

@@ -1,6 +1,7 @@
-"""Flight logs to transitions of a vehicle's model.
+"""Flight logs to transitions of a vehicle's model: CSV, PX4 ULog, ROS bags.
 
-read -> units and frames -> reject impossible rows -> cut the ground -> split into unbroken runs -> control periods.
+read -> bring topics to one clock -> units and frames -> reject impossible rows -> cut the ground -> split into unbroken
+runs -> control periods.
 What a log lacks is stood in for: the thrust comes from motor commands, and body-rate commands, where they were not
 logged, are those that would have led the vehicle's rate loop to the measured mean rates.
 
@@ -23,8 +24,8 @@ import torch
 
 from adapt.control_periods import FORCE_NAMES, control_periods
 from adapt.log_cleaning import REASONS, airborne, check_period, reject, unbroken_runs
-from adapt.log_rows import convert, read_table
-from adapt.mappings import find_mapping
+from adapt.log_rows import convert
+from adapt.log_topics import read_log
 from adapt.transitions import Transitions
 from envs.errors import InputError
 from envs.vehicles import Vehicle
@@ -44,6 +45,7 @@ class LogReport:
     transitions: int = 0
     beyond_limits: int = 0  # transitions with an action outside [-1, 1]: they are kept as they are
     seconds: float = 0.0  # [s] flown
+    damaged: bool = False  # parts of the file could not be read
 
     def __str__(self):
         lines = [(f"{self.log} ({self.mapping})", ""), ("rows read", f"{self.rows}")]
@@ -51,6 +53,8 @@ class LogReport:
         lines += [("  on the ground", f"{self.ground}"), ("  in no whole control period", f"{self.unused}")]
         lines += [("transitions", f"{self.transitions}"), ("  unbroken runs", f"{self.trajectories}")]
         lines += [("  beyond the action limits", f"{self.beyond_limits}"), ("seconds flown", f"{self.seconds:.1f}")]
+        if self.damaged:
+            lines[1:1] = [("damaged: what could be read of it", "")]
         width = max(len(label) for label, _ in lines)
         return "\n".join(f"{label:<{width}} {value:>8}".rstrip() for label, value in lines)
 
@@ -71,20 +75,20 @@ class FlightLog:
 
 
 def read_flight(path, vehicle, mapping="auto"):
-    """Read a CSV flight log as transitions of `vehicle` over its control period.
+    """Read a flight log as transitions of `vehicle` over its control period.
 
     Args:
-        path: the CSV file.
+        path: CSV, PX4 ULog (.ulg), or ROS bag (.bag, .mcap, .db3, or the folder of a ROS 2 bag).
         vehicle: `Vehicle`; its limits decide which rows are possible.
         mapping: name or TOML file of the column mapping, see `adapt.mappings`; "auto" goes by the columns.
 
     Raises:
-        InputError: naming the file, when it cannot be read, lacks columns, is logged too slowly, or leaves nothing.
+        InputError: naming the file, when it cannot be read, its reader isn't installed, it lacks topics, fields or
+            columns, is logged too slowly, or leaves nothing.
     """
     log = Path(path).name
-    table = read_table(path)
-    mapping = find_mapping(mapping, list(table.columns), log)
-    rows = convert(table, mapping, vehicle, log)
+    table, mapping, missed, damaged = read_log(path, mapping, vehicle.system.dt)
+    rows = convert(table, mapping, vehicle, log)._replace(missed=missed)
     step_limit = check_period(rows.time, vehicle.system.dt, log)
     reasons = reject(rows, vehicle, step_limit)
     possible = reasons < 0
@@ -100,10 +104,10 @@ def read_flight(path, vehicle, mapping="auto"):
             f"{log}: no whole control period of {vehicle.system.dt:g} s left of {len(table)} rows "
             f"({worst or 'none rejected'}; {ground} on the ground); give a longer or cleaner flight"
         )
-    return _flight_log(log, mapping.name, vehicle, pieces, rejected, flying & possible, possible)
+    return _flight_log(log, mapping.name, damaged, vehicle, pieces, rejected, flying & possible, possible)
 
 
-def _flight_log(log, mapping, vehicle, pieces, rejected, used, possible):
+def _flight_log(log, mapping, damaged, vehicle, pieces, rejected, used, possible):
     parts = [np.concatenate(part) for part in list(zip(*pieces, strict=True))[:4]]
     state, action, next_state, context = parts
     lengths = [len(piece.state) for piece in pieces]
@@ -118,6 +122,7 @@ def _flight_log(log, mapping, vehicle, pieces, rejected, used, possible):
         transitions=len(state),
         beyond_limits=int((np.abs(action) > 1).any(1).sum()),
         seconds=len(state) * vehicle.system.dt,
+        damaged=damaged,
     )
     trajectory = np.repeat(np.arange(len(pieces)), lengths)
     names = (("voltage",) if context.shape[1] > len(FORCE_NAMES) else ()) + FORCE_NAMES

@@ -11,10 +11,19 @@ A mapping of one's own is a TOML file, one line a quantity. `motors` or `thrust`
     motors = {columns = ["m1", "m2", "m3", "m4"]}  # commands, made forces by the vehicle's thrust curve
     thrust = {columns = ["T"], unit = "N"}  # collective; N, or m/s^2 per mass
     rate_commands = {columns = ["pd", "qd", "rd"], unit = "deg/s"}  # body
-    voltage = {columns = ["vbat"], unit = "V"}
+    voltage = {columns = ["vbat"], unit = "V", optional = true}  # optional: left out where the log has no such column
+    require = {estimate_valid = [1]}  # rows in which a column has another value are rejected
+
+A column of a CSV is the name in its header. One of a PX4 ULog is `topic.field`, such as `vehicle_attitude.q[0]`, or
+`battery_status[1].voltage_v` for the second instance of a topic; one of a ROS bag is `/topic.field`, such as
+`/odometry.pose.pose.position.x`. The topic of the time column is the clock to which the others are brought, see
+`adapt.log_topics`. In a ROS bag `/topic.recorded` is the time of recording, and times are in seconds.
+
+The shipped mappings of topics are the TOML files in `adapt/mapping_data/`: copy one and change the names.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from importlib import resources
 from pathlib import Path
 
 from envs.errors import InputError
@@ -32,6 +41,7 @@ KINDS = {  # quantity: (SI units it may be given in, number of columns or None f
     "voltage": (("V",), 1, None),
 }
 NEEDED = ("time", "position", "attitude", "velocity", "rates")
+OPTIONAL = ("rate_commands", "voltage")
 AXES = ("z-up", "z-down")
 ORDERS = ("wxyz", "xyzw")
 
@@ -45,6 +55,7 @@ class Quantity:
     factor: float
     frame: str | None = None
     order: str = "wxyz"
+    optional: bool = False
 
 
 @dataclass(frozen=True)
@@ -54,11 +65,24 @@ class Mapping:
     name: str
     quantities: dict[str, Quantity]
     axes: str = "z-up"
+    require: dict[str, tuple] = field(default_factory=dict)  # {column: the values that a row may have there}
 
     @property
     def columns(self):
         """Every column that the mapping reads."""
-        return [column for quantity in self.quantities.values() for column in quantity.columns]
+        return [column for quantity in self.quantities.values() for column in quantity.columns] + list(self.require)
+
+    def missing(self, columns):
+        """What the mapping needs and is not among `columns`."""
+        needed = [quantity for quantity in self.quantities.values() if not quantity.optional]
+        return [c for q in needed for c in q.columns if c not in columns] + [
+            c for c in self.require if c not in columns
+        ]
+
+    def fitted(self, columns):
+        """The same without the optional quantities that `columns` don't hold."""
+        kept = {name: q for name, q in self.quantities.items() if all(column in columns for column in q.columns)}
+        return replace(self, quantities=kept)
 
 
 def parse_mapping(tables, name):
@@ -67,15 +91,24 @@ def parse_mapping(tables, name):
     Raises:
         InputError: naming the mapping and the entry, for unknown or missing entries, units, frames and orders.
     """
-    if unknown := [entry for entry in tables if entry not in KINDS and entry != "axes"]:
-        raise InputError(f"mapping {name}: unknown entry {unknown[0]!r}; expected axes or some of {', '.join(KINDS)}")
+    if unknown := [entry for entry in tables if entry not in (*KINDS, "axes", "require")]:
+        known = ", ".join(KINDS)
+        raise InputError(f"mapping {name}: unknown entry {unknown[0]!r}; expected axes, require or some of {known}")
     if missing := [entry for entry in NEEDED if entry not in tables]:
         raise InputError(f"mapping {name}: lacks {', '.join(missing)}")
     if "motors" not in tables and "thrust" not in tables:
         raise InputError(f"mapping {name}: lacks motors or thrust, one of which is needed")
     axes = _one_of(tables.get("axes", AXES[0]), AXES, f"mapping {name}: axes")
     quantities = {entry: _quantity(entry, tables[entry], name) for entry in KINDS if entry in tables}
-    return Mapping(name, quantities, axes)
+    if optional := [entry for entry in quantities if entry not in OPTIONAL and quantities[entry].optional]:
+        raise InputError(f"mapping {name}: {optional[0]}: optional applies to {' and '.join(OPTIONAL)} only")
+    return Mapping(name, quantities, axes, _require(tables.get("require", {}), name))
+
+
+def _require(given, name):
+    if not isinstance(given, dict) or not all(isinstance(values, list) and values for values in given.values()):
+        raise InputError(f"mapping {name}: require is {given!r}, expected {{column = [values that are good]}}")
+    return {column: tuple(values) for column, values in given.items()}
 
 
 def _quantity(entry, given, name):
@@ -83,8 +116,8 @@ def _quantity(entry, given, name):
     units, width, frame = KINDS[entry]
     if not isinstance(given, dict) or not isinstance(given.get("columns"), list | tuple):
         raise InputError(f'{where} is {given!r}, expected {{columns = [...], unit = "..."}}')
-    optional = {"frame": frame is not None, "order": entry == "attitude"}
-    allowed = ("columns", "unit", *(key for key, applies in optional.items() if applies))
+    applies = {"frame": frame is not None, "order": entry == "attitude"}
+    allowed = ("columns", "unit", "optional", *(key for key in applies if applies[key]))
     if unknown := [key for key in given if key not in allowed]:
         raise InputError(f"{where}: unknown key {unknown[0]!r}; expected some of {', '.join(allowed)}")
     columns = tuple(given["columns"])
@@ -94,7 +127,8 @@ def _quantity(entry, given, name):
     if frame is not None:
         frame = _one_of(given.get("frame", frame), ("world", "body"), f"{where}: frame")
     order = _one_of(given.get("order", ORDERS[0]), ORDERS, f"{where}: order")
-    return Quantity(columns, unit, factor, frame, order)
+    optional = _one_of(given.get("optional", False), (True, False), f"{where}: optional")
+    return Quantity(columns, unit, factor, frame, order, optional)
 
 
 def _unit(unit, units, where):
@@ -149,38 +183,66 @@ MAPPINGS = {
 }
 
 
-def find_mapping(name_or_path, columns, log):
-    """The mapping that reads a log with these columns.
+# What "auto" tries for a kind of file, in this order; beside tables these are TOML files.
+KINDS_OF_FILE = {
+    "csv": tuple(MAPPINGS),
+    "ulog": ("px4_odometry", "px4", "px4_outputs"),
+    "rosbag": ("ros",),
+}
+
+
+def find_mappings(name_or_path, kind="csv"):
+    """The mappings that a name stands for: one, or for "auto" all built-in ones for that kind of file, best first.
 
     Args:
         name_or_path: "auto", the name of a built-in mapping, or the path of a TOML file.
-        columns: the column names of the log.
-        log: what the log is called in errors.
+        kind: of file, one of `KINDS_OF_FILE`.
 
     Raises:
-        InputError: when the mapping is unknown, or columns that it needs are missing.
+        InputError: when the mapping is unknown or wrong.
     """
     text = str(name_or_path)
     if text == "auto":
-        return _first_that_fits(columns, log)
-    if text in MAPPINGS:
-        mapping = MAPPINGS[text]
-    elif text.endswith(".toml"):
-        mapping = parse_mapping(read_toml(text), Path(text).name)
-    else:
-        raise InputError(f"--mapping {text}: expected auto, one of {', '.join(MAPPINGS)}, or the path of a .toml file")
-    if missing := [column for column in mapping.columns if column not in columns]:
-        raise InputError(f"{log}: mapping {mapping.name} needs the columns {', '.join(missing)}, which are missing")
-    return mapping
+        return [_shipped(name) for name in KINDS_OF_FILE[kind]]
+    shipped = [name for names in KINDS_OF_FILE.values() for name in names]
+    if text in shipped:
+        return [_shipped(text)]
+    if text.endswith(".toml"):
+        return [parse_mapping(read_toml(text), Path(text).name)]
+    raise InputError(f"--mapping {text}: expected auto, one of {', '.join(shipped)}, or the path of a .toml file")
 
 
-def _first_that_fits(columns, log):
-    lacks = {name: [column for column in m.columns if column not in columns] for name, m in MAPPINGS.items()}
-    for name, missing in lacks.items():
-        if not missing:
-            return MAPPINGS[name]
-    closest = min(lacks, key=lambda name: len(lacks[name]))
+def _shipped(name):
+    if name in MAPPINGS:
+        return MAPPINGS[name]
+    with resources.as_file(resources.files("adapt") / "mapping_data" / f"{name}.toml") as path:
+        return parse_mapping(read_toml(path), name)
+
+
+def _columns_are_missing(columns):
+    return f"the columns {', '.join(columns)}, which are missing"
+
+
+def choose_mapping(mappings, columns, log, lacks=_columns_are_missing):
+    """The first of the mappings that reads a log with these columns, less its optional quantities that they lack.
+
+    Args:
+        mappings: of `find_mappings`.
+        columns: the column names of the log.
+        log: what the log is called in errors.
+        lacks: from missing columns to words that follow "needs".
+
+    Raises:
+        InputError: when columns that are needed are missing.
+    """
+    missing = {mapping.name: mapping.missing(columns) for mapping in mappings}
+    for mapping in mappings:
+        if not missing[mapping.name]:
+            return mapping.fitted(columns)
+    closest = min(missing, key=lambda name: len(missing[name]))
+    if len(mappings) == 1:
+        raise InputError(f"{log}: mapping {closest} needs {lacks(missing[closest])}")
     raise InputError(
-        f"{log}: no built-in mapping fits; {closest} is closest and lacks the columns {', '.join(lacks[closest])}; "
+        f"{log}: no built-in mapping fits; {closest} is closest and needs {lacks(missing[closest])}; "
         "describe the log in a mapping .toml file"
     )

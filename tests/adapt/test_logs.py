@@ -338,6 +338,19 @@ def test_another_lab_s_units_frames_and_order_give_the_same_transitions(tmp_path
         np.testing.assert_allclose(getattr(theirs, part), getattr(ours, part), atol=1e-6)
 
 
+def test_rows_that_lack_a_required_value_are_rejected_and_an_optional_quantity_may_be_absent(tmp_path):
+    own = "require = {mode = [2, 3]}" + OWN + 'voltage = {columns = ["volts"], unit = "V", optional = true}'
+    (tmp_path / "own.toml").write_text(own)
+    table = hovering().assign(mode=2)
+    table.loc[100:, "mode"] = 3
+    table.loc[150:159, "mode"] = 4
+    flight = read_flight(written(tmp_path, table), VEHICLE, tmp_path / "own.toml")
+    assert {k: v for k, v in flight.report.rejected.items() if v} == {"not valid by its own flags": 10}
+    assert "voltage" not in flight.context_names
+    with_volts = read_flight(written(tmp_path, table.assign(volts=3.7)), VEHICLE, tmp_path / "own.toml")
+    assert with_volts.context_names[0] == "voltage"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -351,6 +364,14 @@ def test_another_lab_s_units_frames_and_order_give_the_same_transitions(tmp_path
         ("position = {", 'position = {frame = "body", ', "position: unknown key 'frame'"),
         ('time = {columns = ["t"], unit = "s"}', 'time = "t"', "time is 't', expected"),
         ("time =", 'axes = "up"\ntime =', "axes is 'up', expected 'z-up' or 'z-down'"),
+        (
+            "velocity = {",
+            "velocity = {optional = true, ",
+            "own.toml: velocity: optional applies to rate_commands and voltage",
+        ),
+        ("time =", "require = {ok = 1}\ntime =", "mapping own.toml: require is .*, expected"),
+        ("time =", "require = {pz = [7]}\ntime =", "flight.csv: pz is 1 in all rows, mapping own.toml requires 7"),
+        ("time =", "require = {ok = [1]}\ntime =", "mapping own.toml needs the columns ok, which are missing"),
         ('"motor4"', '"motor9"', "flight.csv: mapping own.toml needs the columns motor9, which are missing"),
     ],
 )
@@ -379,7 +400,7 @@ def test_files_that_are_no_flight_log_say_so_in_one_line(tmp_path):
         written(tmp_path, hovering().iloc[:1], "short.csv"): "1 rows, a flight log needs at least 2",
         written(
             tmp_path, hovering().drop(columns="pz"), "flat.csv"
-        ): "flat.csv: no built-in mapping fits; .* lacks the columns pz",
+        ): "flat.csv: no built-in mapping fits; .* needs the columns pz, which are missing",
         written(tmp_path, hovering().assign(q="west"), "words.csv"): "words.csv: column q holds no number",
         written(tmp_path, hovering().iloc[:20], "brief.csv"): "no whole control period of 0.1 s left of 20 rows",
         written(tmp_path, hovering().assign(motor1=1e6), "mad.csv"): "201 motor command out of range",
@@ -392,8 +413,8 @@ def test_files_that_are_no_flight_log_say_so_in_one_line(tmp_path):
 
 
 def test_an_unknown_mapping_and_a_vehicle_without_motors_are_errors(tmp_path):
-    with pytest.raises(InputError, match="--mapping px4: expected auto, one of nanobench"):
-        read_flight(written(tmp_path, hovering()), VEHICLE, "px4")
+    with pytest.raises(InputError, match="--mapping apm: expected auto, one of nanobench"):
+        read_flight(written(tmp_path, hovering()), VEHICLE, "apm")
     with pytest.raises(InputError, match=r"vehicle crazyflie has no \[motors\] table"):
         read_flight(written(tmp_path, hovering()), replace(VEHICLE, motors=None))
 

@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModule
 
 from adapt.flying import collect
 from adapt.transitions import Transitions, check
-from envs import make_dynamics, make_env, make_system
+from envs import make_dynamics, make_env, make_system, make_task
 from envs.errors import InputError
 
 
@@ -227,3 +227,61 @@ def test_joined_parts_keep_their_trajectories_apart():
     both = joined((part, part))
     assert both.trajectory.tolist() == [0, 0, 1, 1, 1, 2, 2, 3, 3, 3]
     assert torch.equal(both.next_state, torch.cat((part.next_state, part.next_state)))
+
+
+def errors(name, true, seen):
+    """What leads from true to measured states, in units of the preset of noise."""
+    system = make_system(name)
+    x, y = (system.State(*part.double().unbind(-1)) for part in (true, seen))
+    deviations = torch.tensor(make_dynamics(system, "noise=1").noise, dtype=torch.float64)
+    return torch.stack(system.difference(x, y), -1) / deviations
+
+
+@pytest.mark.parametrize("name", ["cartpole", "quadrotor", "fixed_wing"])
+def test_where_sensors_err_what_they_say_is_recorded_of_the_same_flights(name):
+    """An actor that looks at nothing flies the same with noise as without, so that the true states are known."""
+    exact, noisy = (flown(name, target, 500, 0.1) for target in ("drag=0.3", "drag=0.3 noise=1"))
+    for key in ("action", "trajectory"):
+        assert torch.equal(getattr(exact, key), getattr(noisy, key))
+    for key in ("state", "next_state"):
+        error = errors(name, getattr(exact, key), getattr(noisy, key))
+        assert ((error.std(0) - 1).abs() < 5 / math.sqrt(2 * 500)).all()
+        assert (error.mean(0).abs() < 5 / math.sqrt(500)).all()
+    check(noisy, make_system(name))
+
+
+@pytest.mark.parametrize("name", ["cartpole", "quadrotor", "fixed_wing"])
+def test_where_sensors_err_each_recorded_state_is_the_one_that_the_step_before_ended_with(name):
+    data = flown(name, "noise=1", 300)
+    same = data.trajectory[1:] == data.trajectory[:-1]
+    assert same.sum() > 200
+    assert torch.equal(data.state[1:][same], data.next_state[:-1][same])
+
+
+def test_what_a_policy_does_follows_from_the_states_that_are_recorded():
+    task = make_task("quadrotor")
+    columns = torch.randn(15, 4, generator=torch.Generator().manual_seed(2)) / 15
+
+    def act(observation):
+        return (observation @ columns).tanh()
+
+    actor = TensorDictModule(act, in_keys=["observation"], out_keys=["action"])
+    data = collect(actor, make_env("quadrotor", "noise=1", episodes=5), 150)
+    torch.testing.assert_close(data.action, act(task.observe(data.state)))
+
+
+def test_flights_of_another_seed_and_later_flights_of_the_same_have_noise_of_their_own():
+    first, other = (flown(target="noise=1", task="hover", exploration=0.0, seed=seed) for seed in (0, 1))
+    exact = flown(task="hover", exploration=0.0)  # hovering, whatever the seed
+    correlation = (errors("quadrotor", exact.state, first.state) * errors("quadrotor", exact.state, other.state)).mean()
+    assert abs(float(correlation)) < 5 / math.sqrt(30 * 12)
+    assert torch.equal(flown(target="noise=1", task="hover", exploration=0.0).state, first.state)
+    env = make_env("quadrotor", "noise=1", "hover")  # one and the same, with a seed of its own
+    again = [
+        collect(trim_actor("quadrotor"), env, 30, generator=torch.Generator().manual_seed(seed)).state
+        for seed in (0, 1, 0)
+    ]
+    assert torch.equal(again[0], again[2])
+    assert not torch.equal(again[0], again[1])
+    later = flown(target="noise=1", task="hover", n=200, exploration=0.0)
+    assert not torch.equal(later.state[:100], later.state[100:])
