@@ -20,6 +20,7 @@ from envs.errors import InputError
 from envs.pixels import tracking_env
 from policies import METHODS
 from policies.checkpoints import Policy
+from policies.compiled_dynamics import fastest
 from policies.evaluate import Evaluation, evaluate, test_episodes
 
 PICTURE_ROUNDS = 5
@@ -58,7 +59,8 @@ def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None,
     """Continue the training of a policy in other dynamics; the given policy stays as it is.
 
     Args:
-        dynamics: anything that is differentiable, such as a fitted residual.
+        dynamics: anything that is differentiable, such as a fitted residual. On the CPU they are compiled where they
+            can be, see `policies.compiled_dynamics`.
         config: of the policy's method; None is `finetuning(policy)`.
         progress: wraps the iterable of updates and takes its length as `total`, as `tqdm` does.
         footage: for a policy that sees pictures: `Footage` of the target, from whose pictures it learns.
@@ -68,7 +70,10 @@ def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None,
         the new `Policy` and the metrics of each update, with the `seconds` spent until then without judging.
     """
     method, config = METHODS[policy.method].module, config or finetuning(policy)
-    bank = policy.task.episodes(config.episodes, "train", seed).to(next(policy.network.parameters()).device)
+    device = next(policy.network.parameters()).device
+    if device.type == "cpu":
+        dynamics, _ = fastest(dynamics)
+    bank = policy.task.episodes(config.episodes, "train", seed).to(device)
     filmed = {} if footage is None else {"footage": footage}
     run = method.begin(dynamics, policy.task, [bank], config, seed, policy.network, **filmed)
     updates = _judged(method.train(run, dynamics, policy.task, [bank], config), run, judge)

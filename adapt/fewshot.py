@@ -41,7 +41,8 @@ class Options:
     system: str = "quadrotor"
     """Robot: cartpole, quadrotor or fixed_wing."""
     target: Repeatable = ()
-    """What is different in the target, such as drag=0.3 or mass=x1.2; may be repeated (default: drag=0.3)."""
+    """What is different in the target, such as drag=0.3 or mass=x1.2, or noise=1 for sensors that err: 1 mm, 0.02 m/s,
+    0.5 deg, 0.05 rad/s, times 1; may be repeated (default: drag=0.3)."""
     plant: str | None = None
     """Fly a simulator or hardware instead of a target: rotorpy, drone-models, jsbsim, mujoco, or MODULE:FACTORY of your
     own, called with the robot as modelled; it answers to reset and step."""
@@ -76,7 +77,7 @@ class Options:
     vehicle: str | None = None
     """Parameters of your own robot: a shipped name such as crazyflie, or a TOML file."""
     log: Repeatable = ()
-    """Learn from a flight log; may be repeated."""
+    """Learn from a flight log (CSV, PX4 .ulg, ROS bag); may be repeated."""
     validate: Repeatable = ()
     """Flight logs to report the prediction error on; may be repeated."""
     mapping: str = "auto"

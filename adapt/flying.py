@@ -15,14 +15,15 @@ def collect(policy, env, n, exploration=0.0, generator=None):
 
     Whole trajectories count one after another, the last one as far as it is needed: 1000 are ten flights of 100 steps,
     30 are the beginning of one. What follows the end of an episode isn't used. A target that is `one_at_a_time`, as a
-    plant is, flies the same episodes with the same noise one after another; if it is lost, fewer are recorded.
+    plant is, flies the same episodes with the same noise one after another; if it is lost, fewer are recorded. Where a
+    target's sensors err, the states are those that were measured, which the policy saw.
 
     Args:
         policy: TensorDict module that reads `observation` and `window` and writes `action`.
         env: `TrackingEnv` of the target, or the (dynamics, task, episodes) to make one of. Its episodes are flown in
             random order, each again only after all others.
         exploration: standard deviation of Gaussian noise on the actions, which stay in [-1, 1].
-        generator: draws episodes and noise; None is a fresh one with seed 0.
+        generator: draws episodes and noise, that of the measured states too; None is a fresh one with seed 0.
 
     Raises:
         InputError: `n` below 1, negative exploration, or a policy whose flights aren't finite.
@@ -36,6 +37,7 @@ def collect(policy, env, n, exploration=0.0, generator=None):
 
         env = tracking_env(*env)
     generator = generator or torch.Generator().manual_seed(0)
+    env.seed_noise(generator)
     flights, missing, queue = [], n, []
     while missing > 0 and not getattr(env.dynamics, "lost", False):
         count = math.ceil(missing / env.task.steps)
@@ -89,6 +91,8 @@ def _fly_together(policy, env, episodes, steps, noise, flights):
     from tensordict import TensorDict
     from torchrl.envs.utils import step_mdp
 
+    from envs.env import measured
+
     episodes = [episodes[flight] for flight in flights]
     start = TensorDict({"episode": torch.tensor(episodes).unsqueeze(-1)}, batch_size=len(episodes), device=env.device)
     now, record = env.reset(start, set_state=True), []
@@ -97,7 +101,7 @@ def _fly_together(policy, env, episodes, steps, noise, flights):
         now = policy(now)
         now["action"] = (now["action"] + noise(step, flights).to(now["action"])).clamp(-1, 1)
         now = env.step(now)
-        rows = tuple(part.cpu() for part in (now["state"], now["action"], now["next", "state"]))
+        rows = tuple(part.cpu() for part in (measured(now), now["action"], measured(now["next"])))
         flying = flying & torch.cat(rows, -1).isfinite().all(-1)
         record.append((*rows, flying))
         flying = flying & ~now["next", "done"].squeeze(-1).cpu()

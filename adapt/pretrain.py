@@ -75,8 +75,8 @@ class Options:
     """Replace what the folder holds."""
     resume: bool = False
     """Continue the run in --out where it stopped."""
-    compile: bool = False
-    """Compile the dynamics (needs a C++ compiler; pays off in long runs)."""
+    compile: bool = True
+    """Compile the dynamics and their derivative (apg, on the CPU; a C compiler does it in less than a second)."""
     device: str = "cpu"
     """Where to train: cpu, cuda."""
     threads: int = 1
@@ -111,10 +111,10 @@ def main(options):
         keep_best=not (options.policy or pick_method(options.method).pixels),
         every=options.every or getattr(config, "every", -(-config.updates // 10)),
         stop_at=options.stop_at,
-        compile=options.compile,
+        compiled=_compiled(options, dynamics, device),
     )
     network = policy and policy.network.to(device)
-    run = pick_method(options.method).module.begin(dynamics, task, banks, config, options.seed, network)
+    run = pick_method(options.method).module.begin(job.trained_in, task, banks, config, options.seed, network)
     if options.resume:
         training.restore(run, job)
     said = {"options": asdict(options), "config": asdict(config)}
@@ -135,10 +135,6 @@ def check(options):
     for name in ("width", "mode", "horizon"):
         if options.policy and getattr(options, name) is not None:
             raise InputError(f"--{name}: is that of the policy that --policy names; leave it out")
-    if options.compile and not options.method.startswith("apg"):
-        raise InputError(
-            f"--compile: is for apg, which differentiates the dynamics; {options.method} has no use for it"
-        )
     if options.camera and (options.policy or not pick_method(options.method).pixels):
         reason = "the policy brings its own" if options.policy else f"{options.method} sees the state"
         raise InputError(f"--camera: {reason}; leave it out")
@@ -190,6 +186,18 @@ def _setting(options, system, policy):
     from adapt.residual_kinds import load_residual
 
     return task, load_residual(options.residual, make_dynamics(system)).requires_grad_(False)
+
+
+def _compiled(options, dynamics, device):
+    """The dynamics in machine code, where that is asked for, of use and possible."""
+    if not (options.compile and options.method.startswith("apg") and device.type == "cpu"):
+        return None
+    from policies.compiled_dynamics import fastest
+
+    quick, reason = fastest(dynamics)
+    if reason:
+        print(f"trains without compiled dynamics, some ten times slower: {reason}")
+    return None if reason else quick
 
 
 def _folder(options, system):

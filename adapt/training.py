@@ -32,7 +32,12 @@ class Job:
     keep_best: bool
     every: int
     stop_at: float | None = None
-    compile: bool = False
+    compiled: object | None = None  # the same dynamics, quicker, to train in
+
+    @property
+    def trained_in(self):
+        """The dynamics that the method trains in."""
+        return self.compiled or self.dynamics
 
 
 def train(run, job):
@@ -44,10 +49,9 @@ def train(run, job):
     log = Log(job.folder, until=run.update)
     best = log.best()
     begin = time.perf_counter() - log.seconds()
-    flown = compiled(job.dynamics) if job.compile else job.dynamics
     bar = tqdm(total=config.updates, initial=run.update, desc=f"training {task.system.name}", unit="update")
     try:
-        for metrics in _until_interrupted(run, method.train(run, flown, task, job.banks, config), job):
+        for metrics in _until_interrupted(run, method.train(run, job.trained_in, task, job.banks, config), job):
             bar.update()
             if run.update % job.every and run.update != config.updates:
                 continue
@@ -86,20 +90,6 @@ def validate(actor, dynamics, task, n=100):
 
     device = next(actor.parameters()).device
     return evaluate(actor, dynamics, task, test_episodes(task, n, "validation").to(device)).summary
-
-
-def compiled(dynamics):
-    """The dynamics compiled by torch, or as they are where that fails."""
-    import torch
-
-    step = torch.compile(lambda state, action: dynamics(state, action))
-    try:
-        sizes = len(dynamics.system.State._fields), len(dynamics.system.Action._fields)
-        step(torch.ones(2, sizes[0]), torch.zeros(2, sizes[1]))
-    except Exception as error:  # any failure of the compiler ends here: eager is always right
-        print(f"--compile: not possible here ({type(error).__name__}), going on without")
-        return dynamics
-    return step
 
 
 def _keep(run, job, row, best):

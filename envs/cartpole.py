@@ -50,6 +50,7 @@ class CartPole(System):
     Action: ClassVar[type] = Action
     accelerations: ClassVar[tuple[str, ...]] = ("v", "omega")
     residual_input_names: ClassVar[tuple[str, ...]] = ("v", "sin theta", "cos theta - 1", "omega", "force")
+    quantities: ClassVar[tuple[str, ...]] = ("position", "velocity", "attitude", "rates")
     bounds: ClassVar[dict[str, tuple[float, float]]] = {
         **dict.fromkeys(("dt", "cart_mass", "pole_mass", "pole_half_length", "force_limit"), (0.0, math.inf)),
         **dict.fromkeys(("gravity", "track_friction", "hinge_friction"), (-1e-9, math.inf)),

@@ -1,10 +1,12 @@
 """Source and target domains: how the robot differs from its model.
 
 A `Domain` changes parameters (a payload, a longer pole) and adds disturbances (drag, wind, a push). The empty domain is
-the source. On the command line a domain is written `drag=0.3`, `mass=x1.2`, `push=0.5,0,0.2`; several combine. Where a
-camera watches the robot, its picture may differ too: `brightness=0.7`, `cart_colour=200,40,40`, `offset_x=0.1`.
+the source. On the command line a domain is written `drag=0.3`, `mass=x1.2`, `push=0.5,0,0.2`; several combine. Its
+sensors may err: `noise=1` is the noise of `NOISE` on every measured state, `noise=0.5` half of it. Where a camera
+watches the robot, its picture may differ too: `brightness=0.7`, `cart_colour=200,40,40`, `camera_noise=4`.
 """
 
+import math
 from dataclasses import dataclass, fields, replace
 from functools import partial
 
@@ -37,20 +39,34 @@ def wind(system, x, u, strength):
 
 
 DISTURBANCES = {"drag": drag, "quadratic_drag": quadratic_drag, "push": push, "wind": wind}
+# Standard deviation of what sensors say of each kind of state; white, independent for each entry, state and step.
+NOISE = {
+    "position": 0.001,  # [m]
+    "velocity": 0.02,  # [m/s]
+    "attitude": math.radians(0.5),  # [rad] about each axis
+    "rates": 0.05,  # [rad/s]
+}
 SCALAR = ("drag", "quadratic_drag")  # disturbances whose strength has no direction and can't be negative
+# The camera's settings as a target names them; its noise goes by another name than that of the measured states.
+PICTURE = {"camera_noise" if name == "noise" else name: name for name in CHANGEABLE}
 
 
 @dataclass(frozen=True)
 class Domain:
-    """How a target differs: parameters, disturbances, and what a camera sees.
+    """How a target differs: parameters, disturbances, what a camera sees, and how far sensors err.
 
     Parameter changes are (field, value) pairs, disturbances (name, strength) with a strength in x, y, z, and changes of
-    the picture (field, text), see `Camera.changed`.
+    the picture (field, text), see `Camera.changed`; `noise` is a factor on `NOISE`.
     """
 
     changes: tuple[tuple[str, float], ...] = ()
     disturbances: tuple[tuple[str, tuple[float, float, float]], ...] = ()
     picture: tuple[tuple[str, str], ...] = ()
+    noise: float = 0.0
+
+    def __post_init__(self):
+        if not 0 <= self.noise < math.inf:
+            raise InputError(f"noise is {self.noise:g}, expected a factor of at least 0")
 
     def apply(self, system):
         """The changed system; its low-level controller keeps the beliefs of the source."""
@@ -59,6 +75,16 @@ class Domain:
     def forces(self):
         """The disturbances as functions (system, x, u) -> {state name: extra rate}."""
         return tuple(partial(DISTURBANCES[name], strength=strength) for name, strength in self.disturbances)
+
+    def deviations(self, system):
+        """Standard deviations of a system's measured states, in the order of `System.difference`; empty without noise.
+
+        Raises:
+            InputError: noise, but a system that doesn't say what its states are.
+        """
+        if self.noise and not system.quantities:
+            raise InputError(f"noise: {system.name} doesn't say what its states are; give its class `quantities`")
+        return tuple(self.noise * NOISE[kind] for kind in system.quantities) if self.noise else ()
 
     def seen(self, task):
         """The task, through the changed camera.
@@ -69,7 +95,8 @@ class Domain:
         if not self.picture:
             return task
         if task.camera is None:
-            name, value = self.picture[0]
+            field, value = self.picture[0]
+            name = next(name for name in PICTURE if PICTURE[name] == field)
             raise InputError(
                 f"--target {name}={value}: changes the picture, but this policy sees the state; leave it out"
             )
@@ -83,7 +110,7 @@ def parse_target(text, system):
         InputError: on an unknown name, a value that isn't a number, or one that makes no physical sense.
     """
     items = text.split() if isinstance(text, str) else [item for part in text for item in part.split()]
-    changes, disturbances, picture = {}, [], []
+    changes, disturbances, picture, noise = {}, [], [], 0.0
     for item in items:
         name, sign, value = item.partition("=")
         if not sign or not name or not value:
@@ -92,14 +119,17 @@ def parse_target(text, system):
             changes.update(_changes(item, name, value, system, changes))
         elif name in DISTURBANCES:
             disturbances.append((name, _strength(item, name, value)))
-        elif system.drawn and name in CHANGEABLE:
-            picture.append((name, value))
+        elif name == "noise":
+            noise = _amount(item, name, value)
+        elif system.drawn and name in PICTURE:
+            picture.append((PICTURE[name], value))
         else:
-            known = ", ".join([*DISTURBANCES, *_parameters(system), *(CHANGEABLE if system.drawn else ())])
+            known = ", ".join([*DISTURBANCES, "noise", *_parameters(system), *(PICTURE if system.drawn else ())])
             raise InputError(f"--target {item}: {system.name} has no {name!r}; expected one of {known}")
-    domain = Domain(tuple(changes.items()), tuple(disturbances), tuple(picture))
+    domain = Domain(tuple(changes.items()), tuple(disturbances), tuple(picture), noise)
     try:
         domain.apply(system)  # all changes at once: one alone may make no sense yet
+        domain.deviations(system)
         Camera().changed(domain.picture)
     except InputError as error:
         raise InputError(f"--target {' '.join(items)}: {error}") from None
@@ -126,13 +156,19 @@ def _changes(item, name, value, system, earlier):
 
 
 def _strength(item, name, value):
-    numbers = tuple(_number(item, part) for part in value.split(","))
     if name in SCALAR:
-        if len(numbers) != 1 or numbers[0] < 0:
-            raise InputError(f"--target {item}: expected one number of at least 0, such as {name}=0.3")
-    elif len(numbers) not in (1, 3):
+        return _amount(item, name, value), 0.0, 0.0
+    numbers = tuple(_number(item, part) for part in value.split(","))
+    if len(numbers) not in (1, 3):
         raise InputError(f"--target {item}: expected one number (along x) or three (x,y,z)")
     return (*numbers, 0.0, 0.0)[:3]
+
+
+def _amount(item, name, value):
+    numbers = [_number(item, part) for part in value.split(",")]
+    if len(numbers) != 1 or numbers[0] < 0:
+        raise InputError(f"--target {item}: expected one number of at least 0, such as {name}=0.3")
+    return numbers[0]
 
 
 def _number(item, text):

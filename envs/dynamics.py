@@ -52,18 +52,23 @@ class Dynamics:
     """A robot over one control period: `dynamics(state, action) -> next_state`.
 
     `disturbances` are functions (system, x, u) -> {state name: extra rate}. A `Dynamics` without any is the source.
+    `noise` says how far sensors err, see `sensed`: a step is exact, and whoever flies the robot measures its states.
     """
 
     system: System
     disturbances: tuple[Callable, ...] = ()
     integrator: str = "rk4"
     substeps: int = 1  # [-] integrator steps in a control period
+    noise: tuple[float, ...] = ()  # standard deviations of a measured state, an entry for each of `system.quantities`
 
     def __post_init__(self):
         if self.integrator not in INTEGRATORS:
             raise InputError(f"integrator {self.integrator!r}: expected one of {', '.join(INTEGRATORS)}")
         if self.substeps < 1:
             raise InputError(f"substeps is {self.substeps}, expected at least 1")
+        if self.noise and len(self.noise) != len(self.system.quantities):
+            expected = f"expected {len(self.system.quantities)}, one for each of its `quantities`"
+            raise InputError(f"{self.system.name}: noise has {len(self.noise)} entries, {expected}")
 
     @property
     def dt(self):
@@ -106,3 +111,15 @@ class Dynamics:
         action = casadi.SX.sym("action", len(self.system.Action._fields))
         following = self.advance(state, action, backend=casadi_backend())
         return casadi.Function("dynamics", [state, action], [following], ["state", "action"], ["next_state"])
+
+
+def sensed(system, state, deviations, generator):
+    """What sensors say of states (..., n): moved by white noise in their tangent space, so a quaternion stays one.
+
+    Args:
+        deviations: standard deviations (d,) in the order of `System.difference`.
+        generator: draws the noise, on the CPU.
+    """
+    drawn = torch.randn(*state.shape[:-1], len(deviations), generator=generator).to(state)
+    error = drawn * drawn.new_tensor(deviations)
+    return TORCH.pack(tuple(system.displaced(system.State(*TORCH.unpack(state)), TORCH.unpack(error))))

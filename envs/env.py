@@ -5,6 +5,8 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from envs.dynamics import sensed
+
 
 class TrackingEnv(EnvBase):
     """Stateless, batched environment; everything that changes travels in the TensorDict.
@@ -21,13 +23,19 @@ class TrackingEnv(EnvBase):
     | `reward`      | (*B, 1)   | minus the task's cost of the step, see `Task.rewarded`   |
     | `terminated`  | (*B, 1)   | diverged, or arrived                                     |
     | `diverged`    | (*B, 1)   | failed                                                   |
+    | `measured`    | (*B, n)   | what sensors say of the state; only where they err       |
 
     `truncated` is set at the last step of the task, and where a robot strays beyond `threshold`. Dynamics, domain and
     episodes belong to the environment, so a partial reset can't lose them. Gradients flow through `rollout`.
 
+    Where sensors err, `observation`, `window` and `reference` are made of `measured`: a reference may begin where the
+    robot is, and would tell a planner. Noise is drawn once for each state, from the seed of the environment, so that
+    what was seen is a record without gaps. Rewards and ends are those of the true state, by which the flight goes on.
+
     Args:
         dynamics: anything that maps (..., n), (..., m) to (..., n) and has `.system`. Where it has `begin`, every start
-            is passed to it, and a flight begins at the state that it returns.
+            is passed to it, and a flight begins at the state that it returns. Its `noise`, if it has
+            any, says how far sensors err, see `envs.dynamics.sensed`.
         episodes: (N, ...) rows as `task.episodes` draws them. May be exchanged for as many others while it runs.
         anywhere: begin drawn episodes at random steps of their references instead of the first.
         threshold: distance from the reference (`task.distance`) beyond which an episode is cut off; None: no limit.
@@ -42,6 +50,7 @@ class TrackingEnv(EnvBase):
         super().__init__(device=torch.device(device), batch_size=torch.Size(batch_size))
         self.dynamics, self.task = dynamics, task
         self.anywhere, self.threshold = anywhere, threshold
+        self.noise = getattr(dynamics, "noise", ())
         self.episodes = episodes.to(self.device)
         self._supports_set_state = True
         self._make_specs()
@@ -72,6 +81,8 @@ class TrackingEnv(EnvBase):
             shape=batch,
             **table,
         )
+        if self.noise:
+            self.observation_spec["measured"] = real(state)
         actions = len(self.dynamics.system.Action._fields)
         self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, actions), dtype=state.dtype, **table)
         self.reward_spec = Unbounded(shape=(*batch, 1), dtype=state.dtype, **table)
@@ -80,12 +91,14 @@ class TrackingEnv(EnvBase):
     def _reset(self, tensordict=None, *, set_state=False, **kwargs):
         """Starts the episodes that the TensorDict names if it has no state, else some at random.
 
-        With `set_state` it goes on from the state, episode and step of the TensorDict.
+        With `set_state` it goes on from the state, episode and step of the TensorDict, and from what was measured if
+        that is there, too.
         """
         batch = self.batch_size if tensordict is None else tensordict.batch_size
         given = set() if tensordict is None else set(tensordict.keys())
         if set_state and "state" in given:
-            return self._described(tensordict["state"], tensordict["episode"], tensordict["step"])
+            place = (tensordict[key] for key in ("state", "episode", "step"))
+            return self._described(*place, tensordict.get("measured", None))
         if "episode" in given and not given & {"_reset", "state"}:
             episode = tensordict["episode"]
         else:
@@ -131,22 +144,40 @@ class TrackingEnv(EnvBase):
         following["reward"] = -cost.reshape(*batch, 1)
         return following
 
-    def _described(self, state, episode, step):
-        """A TensorDict of the state and all that follows from it."""
+    def _described(self, state, episode, step, measured=None):
+        """A TensorDict of the state and all that follows from it; `measured` is drawn unless it is given."""
         batch = state.shape[:-1]
         rows, flat_step, flat = self.episodes[episode.reshape(-1)], step.reshape(-1), state.reshape(-1, state.shape[-1])
-        reference = self.task.reference(rows, flat_step, flat)
-        window = self.task.window(flat, reference)
+        if self.noise and measured is None:
+            measured = sensed(self.dynamics.system, state, self.noise, self.generator)
+        seen = measured.reshape(flat.shape) if self.noise else flat
+        reference = self.task.reference(rows, flat_step, seen)
+        window = self.task.window(seen, reference)
         described = {
             "state": state,
             "episode": episode,
             "step": step,
-            "observation": self.task.observe(flat).reshape(*batch, -1),
+            "observation": self.task.observe(seen).reshape(*batch, -1),
             "window": window.reshape(*batch, *window.shape[1:]),
             "reference": reference.reshape(*batch, *reference.shape[1:]),
             "diverged": self.task.diverged(rows, flat_step, flat).reshape(*batch, 1),
         }
+        if self.noise:
+            described["measured"] = measured
         return TensorDict(described, batch_size=batch, device=self.device)
+
+    def seed_noise(self, generator):
+        """Let what is measured from now on follow from the present state of a generator, which stays as it is.
+
+        So the same flights are flown with noise as without.
+        """
+        if self.noise:
+            self.set_seed(int(torch.randint(2**31, (), generator=generator.clone_state())))
 
     def _set_seed(self, seed):
         self.generator = torch.Generator().manual_seed(0 if seed is None else seed)
+
+
+def measured(tensordict):
+    """What sensors say of the state in a TensorDict of `TrackingEnv`: the state itself where they don't err."""
+    return tensordict.get("measured", tensordict["state"])

@@ -75,6 +75,9 @@ class FixedWing(System):
         *("p", "q", "r", *Action._fields),
         *(f"{axis} in body {own}" for axis in ("north", "east") for own in "xyz"),
     )
+    quantities: ClassVar[tuple[str, ...]] = tuple(
+        kind for kind in ("position", "attitude", "velocity", "rates") for _ in range(3)
+    )
     bounds: ClassVar[dict[str, tuple[float, float]]] = {
         **dict.fromkeys(("dt", "mass", "inertia_x", "inertia_y", "inertia_z", "thrust_max"), (0.0, math.inf)),
         **dict.fromkeys(("elevator_limit", "aileron_limit", "rudder_limit", "incidence_limit"), (0.0, math.pi / 2)),

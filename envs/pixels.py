@@ -63,7 +63,8 @@ def tracking_env(dynamics, task, episodes, batch_size=(), device="cpu", seed=0, 
     if task.camera is None:
         return env
     filmed = TransformedEnv(env, Pixels(task.camera, seed))
-    spec = {key: filmed.observation_spec[key].clone() for key in PLACE}
+    keys = (*PLACE, "measured") if env.noise else PLACE
+    spec = {key: filmed.observation_spec[key].clone() for key in keys}
     env.state_spec = Composite(spec, shape=env.batch_size, device=env.device)
     filmed.empty_cache()
     return filmed

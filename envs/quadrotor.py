@@ -70,6 +70,9 @@ class Quadrotor(System):
         *("p", "q", "r", *Action._fields),
         *(f"{axis} in body {own}" for axis in ("world x", "world y") for own in "xyz"),
     )
+    quantities: ClassVar[tuple[str, ...]] = tuple(
+        kind for kind in ("position", "attitude", "velocity", "rates") for _ in range(3)
+    )
     bounds: ClassVar[dict[str, tuple[float, float]]] = {
         **dict.fromkeys(
             ("dt", "mass", "inertia_x", "inertia_y", "inertia_z", "rate_gain_x", "rate_gain_y", "rate_gain_z")

@@ -29,7 +29,7 @@ def make_dynamics(system, target="", integrator="rk4", substeps=1):
     """Dynamics of a system (name or instance) in a target domain (`Domain`, or text such as "drag=0.3 mass=x1.2")."""
     system = make_system(system)
     domain = target if isinstance(target, Domain) else parse_target(target, system)
-    return Dynamics(domain.apply(system), domain.forces(), integrator, substeps)
+    return Dynamics(domain.apply(system), domain.forces(), integrator, substeps, domain.deviations(system))
 
 
 def make_task(system, set=None, **options):

@@ -36,6 +36,8 @@ class System(ABC):
     Action: ClassVar[type]  # NamedTuple of the action's scalars, each in [-1, 1]
     accelerations: ClassVar[tuple[str, ...]]  # state rows that a force or torque acts on
     residual_input_names: ClassVar[tuple[str, ...]]  # of `residual_inputs`
+    # What each entry of `difference` is, "position", "velocity", "attitude" or "rates": sensors err by kind.
+    quantities: ClassVar[tuple[str, ...]] = ()
     bounds: ClassVar[dict[str, tuple[float, float]]] = {}  # open interval of each checked parameter
     groups: ClassVar[dict[str, tuple[str, ...]]] = {}  # one name for several fields that are scaled together
     axes: ClassVar[dict[str, Axis]] = {}  # how states are shown; those without one go by their name

@@ -129,7 +129,7 @@ class Training:
             "network": self.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
-            "place": {name: self.place[name] for name in PLACE},
+            "place": dict(self.place.select(*PLACE, "measured", strict=False).items()),
             "footage": self.footage.tensors(),
             "update": self.update,
             "skipped": self.skipped,

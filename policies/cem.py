@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torchrl.modules import CEMPlanner
 
-from envs.env import TrackingEnv
+from envs.env import TrackingEnv, measured
 from envs.errors import InputError
 
 ROWS = 5000  # particles that are advanced at once: more would not stay in the cache of a core
@@ -47,8 +47,9 @@ class PlannerConfig:
 class CEM(CEMPlanner):
     """TorchRL's planner for batched environments, with warm start, momentum, a least standard deviation and particles.
 
-    A TensorDict policy: reads `state` and `reference`, writes `action`. Where `episode` and `step` say that a row goes
-    on from its last call, it starts from the rest of its last plan. Rows with `done` set get the trim action.
+    A TensorDict policy: reads `state`, or in its place `measured`, and `reference`, writes `action`. Where `episode`
+    and `step` say that a row goes on from its last call, it starts from the rest of its last plan. Rows with `done` set
+    get the trim action.
 
     A plan's cost is that of the task, averaged over all particles. Candidates of an iteration share their noise, so
     that they are compared on equal terms. One whose cost isn't finite is never an elite; where none is finite in any
@@ -74,7 +75,8 @@ class CEM(CEMPlanner):
         """The first actions (*B, m) of the plans."""
         batch = tensordict.batch_size
         state, reference = (
-            tensordict[key].flatten(0, len(batch) - 1) if batch else tensordict[key][None] for key in self.in_keys
+            part.flatten(0, len(batch) - 1) if batch else part[None]
+            for part in (measured(tensordict), tensordict["reference"])
         )
         mean, warm, place = self._start(tensordict, state)
         std = torch.where(warm, self.config.warm_std, self.config.cold_std).to(state)

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from envs.drawing import draw
+from envs.dynamics import sensed
 from envs.pixels import tracking_env
 
 WARM_UP = 20  # calls that are not timed: the first ones set things up
@@ -18,7 +19,7 @@ TEST_EPISODES = {"cartpole": 50, "quadrotor": 50, "fixed_wing": 30}  # as many a
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Result of flying N episodes: a table with one row each, and the flown states (N, steps + 1, n).
+    """Result of flying N episodes: a table with one row each, and the true states (N, steps + 1, n).
 
     Behind the end of an episode, states repeat the last one; actions there led to nothing, or are zero.
     """
@@ -51,7 +52,8 @@ def evaluate(actor, dynamics, task, episodes, progress=None):
 
     States behind the end of an episode repeat the last one. The policy is still called on such a row while others fly,
     with `done` set, so that a planner can leave it out; when all have ended, so does the evaluation. Dynamics that are
-    `one_at_a_time`, as a plant is, fly the episodes one after another.
+    `one_at_a_time`, as a plant is, fly the episodes one after another. Where sensors err, a policy sees what they say,
+    with the same noise for every policy that flies these episodes, and is scored by where it truly was.
 
     Args:
         progress: wraps the iterable of steps, or of flights one at a time, as `tqdm` does.
@@ -121,7 +123,7 @@ class FlightForTiming:
 
     def __init__(self, dynamics, task, episodes=20):
         self.dynamics, self.task = dynamics, task
-        self.episodes = task.episodes(episodes, "validation", 0)
+        self.episodes, self.generator = task.episodes(episodes, "validation", 0), torch.Generator().manual_seed(0)
         self._begin(0)
 
     def _begin(self, episode):
@@ -131,13 +133,18 @@ class FlightForTiming:
 
     def seen(self):
         """What a policy reads, computed now."""
-        task, state = self.task, self.state
+        task, state = self.task, self.measured()
         reference = task.reference(self.episodes[self.episode], self.step, state)
         seen = {"observation": task.observe(state), "window": task.window(state, reference), "reference": reference}
         place = {"state": state, "episode": self.episode.unsqueeze(-1), "step": self.step.unsqueeze(-1)}
         if task.camera is not None:
             seen["pixels"] = self._stacked()
         return TensorDict({**seen, **place, **self.memory}, batch_size=(1,))
+
+    def measured(self):
+        """What sensors say of the present state."""
+        noise = getattr(self.dynamics, "noise", ())
+        return sensed(self.dynamics.system, self.state, noise, self.generator) if noise else self.state
 
     def _stacked(self):
         """The last pictures; the present one is drawn now."""

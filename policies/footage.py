@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
+from envs.env import measured
+
 # Share of a task's last threshold beyond which a filmed robot begins again. States far from the goal cost a hundred
 # times more and would be all that a policy learns from: with 1 the validation error was 0.065 m/s, with 0.5 it is
 # 0.041, and 0.25 learns late (two seeds each).
@@ -75,9 +77,9 @@ class Footage:
         parts = {
             "frames": now["pixels"][:, :3],
             "stacks": stacks,
-            "state": now["state"],
+            "state": measured(now),
             "action": action,
-            "next_state": following["next", "state"],
+            "next_state": measured(following["next"]),
             "flight": flight,
         }
         for name, part in parts.items():

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
 
+from envs.env import measured
 from envs.errors import InputError
 from policies.mpc_solvers import LARGEST, Buffered, make_solver
 
@@ -19,9 +20,10 @@ def actor(dynamics, task, solver="fatrop", compile=False, seed=0):
 class MPC(TensorDictModuleBase):
     """A TensorDict policy that solves one optimal control problem for each row of the batch.
 
-    It reads `state` (*B, n) and `reference` (*B, H, r), and `step`, `episode` and `done` (*B, 1) where they are there;
-    it writes `action` (*B, m). A solve starts from the row's last plan, shifted by one, if the row's step is the one
-    after and its episode the same; without `step`, always, until `reset()` or another batch size.
+    It reads `state` (*B, n), or in its place `measured`, and `reference` (*B, H, r), and `step`, `episode` and `done`
+    (*B, 1) where they are there; it writes `action` (*B, m). A solve starts from the row's last plan, shifted by one,
+    if the row's step is the one after and its episode the same; without `step`, always, until `reset()` or another
+    batch size.
 
     A solve that fails, as one from a state that isn't finite, counts in `failures`: the row goes on with the shifted
     plan, or with the trim action if there is none, and its next solve starts afresh. `calls` counts the solves. A row
@@ -58,7 +60,7 @@ class MPC(TensorDictModuleBase):
         self._memory = []
 
     def forward(self, tensordict):
-        state, reference = tensordict["state"], tensordict["reference"]
+        state, reference = measured(tensordict), tensordict["reference"]
         if reference.shape[-2] != self.horizon:
             raise InputError(f"MPC: reference of {reference.shape[-2]} points, expected the horizon {self.horizon}")
         states = _rows(state, 1)

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import step_mdp
 
-from envs.env import TrackingEnv
+from envs.env import TrackingEnv, measured
 from envs.errors import InputError
 from policies.cem import CEM, PlannerConfig
 from policies.ensemble import Ensemble, EnsembleDynamics, FitConfig, fit, model_inputs, model_outputs
@@ -176,12 +176,15 @@ def train(run, dynamics, task, banks, config):
 def fly(policy, dynamics, task, episodes, budget, noise, generator):
     """Fly random episodes side by side, as many as the budget would last for, and each once at most to its end.
 
+    The states are those that were measured, where sensors err.
+
     Returns:
         (state, action, next_state) of the transitions, (M, ...) each, the finite ones, and the cost of each transition
         taken, at most `budget` of them.
     """
     count = math.ceil(budget / task.steps)
     env = TrackingEnv(dynamics, task, episodes, batch_size=(count,), device=episodes.device)
+    env.seed_noise(generator)
     chosen = torch.randint(len(episodes), (count, 1), generator=generator).to(episodes.device)
     now = env.reset(TensorDict({"episode": chosen}, batch_size=(count,), device=env.device))
     record, costs = [], []
@@ -193,7 +196,7 @@ def fly(policy, dynamics, task, episodes, budget, noise, generator):
         now["action"] = (now["action"] + exploring).clamp(-1, 1)
         now = env.step(now)
         budget -= int(flying.sum())
-        rows = tuple(part[flying].cpu() for part in (now["state"], now["action"], now["next", "state"]))
+        rows = tuple(part[flying].cpu() for part in (measured(now), now["action"], measured(now["next"])))
         finite = torch.cat(rows, -1).isfinite().all(-1)
         record.append(tuple(part[finite] for part in rows))
         costs.append(-now["next", "reward"][flying, 0].cpu())

@@ -79,11 +79,17 @@ def joined(network, dynamics, task, episodes, config):
 
 
 def fly(run, parts, seed):
-    """The next transitions (B, T) of all robots. The collector is told where they are, so that a run can be resumed."""
+    """The next transitions (B, T) of all robots. The collector is told where they are, so that a run can be resumed.
+
+    Where sensors err, the critic learns from what they say, as the policy does.
+    """
     reseed(parts.env, seed)
     parts.collector.reset(tensordict=run.place, set_state=True)
     flown = parts.collector.rollout()
     run.place = parts.env.maybe_reset(step_mdp(flown[:, -1])).select(*place_keys(parts.tracking.task)).clone()
+    if parts.tracking.noise:
+        flown = flown.copy()  # the collector writes into its own again
+        flown["state"], flown["next", "state"] = flown["measured"], flown["next", "measured"]
     return flown
 
 

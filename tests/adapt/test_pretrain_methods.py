@@ -105,7 +105,6 @@ def test_a_policy_can_be_trained_in_a_model_with_a_residual(call, tmp_path):
         (("--method", "pets", "--samples", "0"), "--samples 0: expected at least 1"),
         (("--method", "apg", "--samples", "100"), "--samples: apg has no such setting"),
         (("--method", "pets", "--curriculum", "0.1"), "--curriculum: pets has no such setting"),
-        (("--method", "ppo", "--compile"), "--compile: is for apg"),
         (("--method", "ppo", "--preset", "paper"), "--preset paper: expected one of"),
         (("--residual", "a.safetensors", "--target", "push=1"), "leave --target out"),
         (("--residual", "none.safetensors"), "none.safetensors: can't read a residual"),

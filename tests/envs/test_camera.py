@@ -40,6 +40,14 @@ def test_a_target_changes_the_picture_and_the_robot():
     assert make_dynamics(system, domain).system.pole_mass == pytest.approx(0.2)
 
 
+def test_noise_of_the_picture_has_a_name_of_its_own_beside_that_of_the_measured_states():
+    domain = parse_target("noise=0.5 camera_noise=4", make_system("cartpole"))
+    assert domain.seen(make_task("cartpole", camera=Camera())).camera.noise == 4.0
+    assert domain.noise == 0.5
+    with pytest.raises(InputError, match="--target camera_noise=4: changes the picture, but this policy"):
+        make_env("cartpole", "camera_noise=4")
+
+
 def test_a_changed_picture_means_nothing_to_a_policy_that_sees_the_state():
     with pytest.raises(
         InputError, match=r"--target brightness=0\.7: changes the picture, but this policy sees the state"
@@ -54,6 +62,7 @@ def test_a_changed_picture_means_nothing_to_a_policy_that_sees_the_state():
         ("cart_colour=1,2", "camera: cart_colour is '1,2', expected red,green,blue"),
         ("blur=1,2,3", "camera: blur is '1,2,3', expected one number"),
         ("brightness=-1", "camera: brightness is -1, expected more than 0"),
+        ("camera_noise=-1", "camera: noise is -1, expected at least 0"),
         ("height=64", "cartpole has no 'height'"),
     ],
 )

@@ -114,3 +114,27 @@ def test_gradients_flow_through_the_states_of_a_filmed_flight():
 def test_any_number_of_pictures_is_stacked(frames):
     env = make(task=replace(TASK, camera=replace(CAMERA, frames=frames)))
     assert env.rollout(3)["pixels"].shape[-3] == 3 * frames
+
+
+def test_a_camera_sees_the_robot_not_what_sensors_say_of_it():
+    env = make(target="noise=30")
+    check_env_specs(env)
+    flown = env.rollout(4)
+    for k in range(4):
+        assert torch.equal(flown["pixels"][:, 3, 3 * k : 3 * k + 3], pictures(env, flown["state"][:, 3 - k]))
+    assert (flown["measured"] - flown["state"])[..., 1].std() > 0.3
+
+
+def test_it_goes_on_with_what_was_measured():
+    env = make(target="noise=1")
+    flown = env.rollout(5)
+    place = flown[:, 4].select("state", "episode", "step", "pixels", "measured")
+    onward = env.reset(place.clone(), set_state=True)
+    for key in ("measured", "observation", "pixels"):
+        assert torch.equal(onward[key], flown[key][:, 4]), key
+    now = step_mdp(env.step(onward.set("action", torch.zeros(3, 1))))
+    before = now.clone()
+    now["truncated"][1] = now["done"][1] = True
+    now = env.maybe_reset(now)
+    assert torch.equal(now["measured"][[0, 2]], before["measured"][[0, 2]])
+    assert not torch.equal(now["measured"][1], before["measured"][1])

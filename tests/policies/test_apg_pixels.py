@@ -98,6 +98,17 @@ def test_a_resumed_run_ends_bit_for_bit_where_an_uninterrupted_one_does(stop, tm
     assert torch.equal(run.footage.frames, whole.footage.frames)
 
 
+def test_a_run_whose_sensors_err_is_resumed_with_what_was_measured_last():
+    dynamics, banks = make_dynamics("cartpole", "noise=1"), [TASK.episodes(20, "train", 0)]
+    run, resumed = (apg_pixels.begin(dynamics, TASK, banks, TINY, 0) for _ in range(2))
+    resumed.load_state_dict(run.state_dict(), banks, TINY, TASK)
+    assert torch.equal(resumed.place["measured"], run.place["measured"])
+    for one in (run, resumed):
+        list(apg_pixels.train(one, dynamics, TASK, banks, TINY))
+    assert torch.equal(resumed.footage.state, run.footage.state)
+    assert torch.equal(weights(resumed), weights(run))
+
+
 def test_fine_tuning_on_given_footage_films_nothing_and_leaves_the_old_network_alone():
     first = trained()
     before, filmed = weights(first).clone(), first.samples

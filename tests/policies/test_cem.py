@@ -366,3 +366,10 @@ def test_settings_that_make_no_sense_are_refused(changes):
     name, value = next(iter(changes.items()))
     with pytest.raises(InputError, match=f"PlannerConfig.{name} {value}: expected "):
         PlannerConfig(**changes)
+
+
+def test_it_plans_from_what_was_measured_where_sensors_err(task):
+    state = torch.tensor([[0.0, 0.5, 0.0, 0.0]])
+    true, seen = situation(task, [0.1]), situation(task, [0.5])
+    both = seen.clone().set("state", true["state"]).set("measured", state)
+    assert torch.equal(planner(task)(both)["action"], planner(task)(seen)["action"])

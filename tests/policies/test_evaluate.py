@@ -267,3 +267,54 @@ def test_a_policy_is_told_which_rows_have_ended_and_all_ended_ends_the_evaluatio
     assert len(calls) < task.steps
     assert result.states.shape == (3, task.steps + 1, 13)
     assert result.actions.shape == (3, task.steps, 4)
+
+
+class Watching:
+    """An actor that always does the same, and remembers what it saw."""
+
+    def __init__(self, *action):
+        self.action, self.seen = torch.tensor(action, dtype=torch.float64), []
+
+    def __call__(self, tensordict):
+        self.seen.append(tensordict["measured"])
+        return tensordict.set("action", self.action.expand(*tensordict.batch_size, -1))
+
+
+def test_a_policy_is_scored_by_where_it_was_not_by_what_its_sensors_said(name):
+    task = make_task(name, steps=30)
+    episodes, trim = task.episodes(5, "test", 0).double(), task.system.trim_action
+    exact = evaluate(constant(*trim), make_dynamics(name, "drag=0.3"), task, episodes)
+    noisy = evaluate(Watching(*trim), make_dynamics(name, "drag=0.3 noise=10"), task, episodes)
+    assert torch.equal(noisy.states, exact.states)
+    assert noisy.table.equals(exact.table)
+
+
+def test_policies_that_are_compared_have_the_same_noise(name):
+    task = make_task(name, steps=30)
+    episodes, trim = task.episodes(100, "test", 0).double(), task.system.trim_action
+    watchers = [Watching(*(entry + more for entry in trim)) for more in (0.0, 0.0, 0.001)]
+    dynamics = make_dynamics(name, "noise=1")
+    flights = [evaluate(watcher, dynamics, task, episodes) for watcher in watchers]
+    assert all(torch.equal(a, b) for a, b in zip(*(watcher.seen for watcher in watchers[:2]), strict=True))
+
+    def errors(number, step):
+        states = flights[number].states[:, step], watchers[number].seen[step]
+        x, y = (task.system.State(*part.unbind(-1)) for part in states)
+        return torch.stack(task.system.difference(x, y), -1)
+
+    for step in (0, 5):
+        torch.testing.assert_close(errors(2, step), errors(0, step), rtol=0, atol=1e-9)
+        expected = torch.tensor(dynamics.noise, dtype=torch.float64)
+        assert ((errors(0, step).std(0) / expected - 1).abs() < 5 / math.sqrt(200)).all()
+    assert not torch.equal(errors(0, 0), errors(0, 5))
+
+
+def test_an_action_is_timed_on_what_sensors_say():
+    task, dynamics = make_task("quadrotor", "hover"), make_dynamics("quadrotor", "noise=1")
+    flight, still = evaluation.FlightForTiming(dynamics, task), torch.tensor([task.system.trim_action])
+    for _ in range(3):
+        state, seen = flight.state, flight.seen()
+        assert 0 < (seen["state"] - state).abs().max() < 0.3
+        assert torch.equal(seen["observation"], task.observe(seen["state"]))
+        flight.advance({"action": still})
+    assert torch.equal(flight.state[:, :3], torch.zeros(1, 3)) or flight.state[:, :3].abs().max() < 1e-5

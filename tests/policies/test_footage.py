@@ -1,6 +1,7 @@
 """Footage: every stack is what the camera showed, and flights are told apart."""
 
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from envs import make_dynamics, make_task
@@ -66,3 +67,19 @@ def test_joined_footage_shows_what_both_parts_show_and_keeps_their_flights_apart
     assert torch.equal(both.pixels(torch.arange(len(both))), torch.cat((first, second)))
     assert not set(both.flight[:60].tolist()) & set(both.flight[60:].tolist())
     assert torch.equal(Footage.empty(TASK).joined(one).stacks, one.stacks)
+
+
+def test_where_sensors_err_the_states_are_what_they_say_and_the_pictures_show_the_robot():
+    clear, pair = make_task("cartpole", camera=Camera(height=24, width=48, scale=9.0)), []
+    for target in ("", "noise=10"):
+        env = tracking_env(make_dynamics("cartpole", target), clear, clear.episodes(20, "train", 0), (3,))
+        start = env.reset(TensorDict({"episode": torch.arange(3)[:, None]}, 3), set_state=True)
+        pair.append(Footage.empty(clear))
+        film(pair[-1], env, None, start, 8, 0.1, torch.Generator().manual_seed(0))
+    exact, noisy = pair
+    assert torch.equal(noisy.frames, exact.frames)
+    error = noisy.state - exact.state
+    assert 0.1 < float(error[:, 1].std()) < 0.4
+    for flight in noisy.flight.unique():
+        rows = (noisy.flight == flight).nonzero().squeeze(-1)
+        assert torch.equal(noisy.state[rows[1:]], noisy.next_state[rows[:-1]])

@@ -537,3 +537,12 @@ def test_the_error_on_validation_episodes_is_small(name, limit):
     assert result.summary["success"] == 1
     assert result.summary["mean"] < limit
     assert mpc.failures == 0
+
+
+def test_it_plans_from_what_was_measured_where_sensors_err():
+    env = make_env("quadrotor", "noise=1", batch_size=(2,), split="validation", episodes=5)
+    now = env.reset()
+    seen = now.select("measured", "reference").rename_key_("measured", "state")
+    actions = [MPC(env.dynamics, env.task)(what.clone())["action"] for what in (now, seen, now.exclude("measured"))]
+    assert torch.equal(actions[0], actions[1])
+    assert not torch.equal(actions[0], actions[2])

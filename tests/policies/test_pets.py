@@ -333,3 +333,20 @@ def test_a_few_hundred_transitions_are_enough_to_balance_a_pole():
 def test_settings_that_make_no_sense_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
         pets.Config(**changes)
+
+
+def test_where_sensors_err_it_learns_from_what_they_say(cartpole):
+    task, source, banks = cartpole
+    dynamics = make_dynamics("cartpole", "noise=1")
+
+    def fly(flown, seed):
+        generator = torch.Generator().manual_seed(seed)
+        return pets.fly(pets.random_actor(task, TINY, 0), flown, task, banks[0][:1], 40, 0.0, generator)[0]
+
+    noisy, other, exact = fly(dynamics, 0), fly(dynamics, 1), fly(source, 0)
+    assert not torch.equal(other[0], noisy[0])
+    assert torch.equal(noisy[1], exact[1])  # the same flights
+    error = (noisy[0] - exact[0]) / torch.tensor(dynamics.noise)
+    assert ((error.std(0) - 1).abs() < 5 / math.sqrt(2 * len(error))).all()
+    rows = torch.arange(0, 16, 2)  # two robots take turns until one has fallen
+    assert torch.equal(noisy[2][rows], noisy[0][rows + 2])

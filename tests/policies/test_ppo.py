@@ -534,3 +534,23 @@ def test_any_network_with_the_same_interface_is_trained(name):
 def test_settings_that_make_no_sense_are_refused_by_name(field, value, message):
     with pytest.raises(InputError, match="^" + message):
         ppo.Config(**{field: value})
+
+
+def test_where_sensors_err_policy_and_critic_learn_from_what_they_say(name, monkeypatch):
+    task, _, banks = setting(name)
+    dynamics, seen, states, original = make_dynamics(name, "noise=1"), [], [], ppo.fly
+    monkeypatch.setattr(ppo, "fly", lambda *args: seen.append(original(*args)) or seen[-1])
+    run = ppo.begin(dynamics, task, banks, TINY, 0)
+    for _ in ppo.train(run, dynamics, task, banks, TINY):
+        flown = seen[-1]
+        assert torch.equal(flown["state"], flown["measured"])
+        assert torch.equal(flown["observation"][:, 0], task.observe(flown["state"][:, 0]))
+        going = ~flown["next", "done"][:, :-1, 0]
+        following = flown["next", "measured"][:, :-1]
+        assert torch.equal(following[going], flown["measured"][:, 1:][going])
+        states.append(flown["state"].clone())  # the collector writes over it
+        onward = ~flown["next", "done"][:, -1, 0]
+        ends = flown["next", "measured"][:, -1]
+        assert not (run.place["state"] == ends)[onward].any()  # flights go on from where the robots truly are
+    assert not torch.equal(states[-1], states[-2])
+    assert run.skipped == 0
