@@ -10,11 +10,14 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from adapt import residual as residuals
+from adapt.bootstrap import fit_ensemble
 from adapt.flying import collect, film_transitions, filmed
+from adapt.gate import Gate, Verdict
 from adapt.plants import flights_of
 from adapt.prediction import prediction_error
 from adapt.residual_dynamics import ResidualDynamics
 from adapt.transitions import Transitions, joined
+from adapt.trust_region import Best
 from envs.dynamics import Dynamics
 from envs.errors import InputError
 from envs.pixels import tracking_env
@@ -25,6 +28,8 @@ from policies.evaluate import Evaluation, evaluate, test_episodes
 
 PICTURE_ROUNDS = 5
 APART = 1_000  # between the seeds of the training episodes of two rounds
+VALIDATIONS = 4  # of the policy that is fine-tuned, in the fitted model
+MEMBERS = 3  # fits to resampled flight that the gate asks
 HELD_OUT = 1000  # transitions flown for the report alone, to measure the prediction error
 
 
@@ -32,16 +37,17 @@ HELD_OUT = 1000  # transitions flown for the report alone, to measure the predic
 class Adaptation:
     """What `adapt` returns: the new policy, the residual it was tuned in, and the evidence."""
 
-    policy: Policy
+    policy: Policy  # the tuned one, or the old one where the gate kept it
     residual: ResidualDynamics
     transitions: Transitions
     fit: residuals.FitReport
-    evaluations: dict[str, Evaluation]  # source, zero_shot, few_shot and perhaps oracle
+    evaluations: dict[str, Evaluation]  # source, zero_shot, few_shot, perhaps refused (by the gate) and oracle
     prediction: dict[str, dict[str, float]]  # one-step errors of "model" and "model + residual"
     history: list[dict]  # metrics of each fine-tuning update
     seconds: dict[str, float] = field(default_factory=dict)
     oracle: Policy | None = None
     flights: dict | None = None  # what flying a plant was like, see `adapt.plants.Flights.report`
+    verdict: Verdict | None = None  # of the gate; None without one
 
 
 def finetuning(policy):
@@ -55,7 +61,7 @@ def usual_finetuning(method, system):
     return module.finetuning(module.PRESETS.get(system.name, module.Config()))
 
 
-def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None, judge=None):
+def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None, judge=None, validations=0):
     """Continue the training of a policy in other dynamics; the given policy stays as it is.
 
     Args:
@@ -65,6 +71,8 @@ def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None,
         progress: wraps the iterable of updates and takes its length as `total`, as `tqdm` does.
         footage: for a policy that sees pictures: `Footage` of the target, from whose pictures it learns.
         judge: called with the network and the number of each update; returns what is added to its metrics.
+        validations: how often the network flies validation episodes in the dynamics on the way. What flies best is
+            returned, be it the policy as given; without any, what was trained last.
 
     Returns:
         the new `Policy` and the metrics of each update, with the `seconds` spent until then without judging.
@@ -76,25 +84,30 @@ def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None,
     bank = policy.task.episodes(config.episodes, "train", seed).to(device)
     filmed = {} if footage is None else {"footage": footage}
     run = method.begin(dynamics, policy.task, [bank], config, seed, policy.network, **filmed)
-    updates = _judged(method.train(run, dynamics, policy.task, [bank], config), run, judge)
+    best = Best(policy, dynamics, config.updates, validations) if validations else None
+    updates = _judged(method.train(run, dynamics, policy.task, [bank], config), run, judge, best)
     history = list(progress(updates, total=config.updates) if progress else updates)
     if run.skipped == config.updates:
         raise InputError("fine-tuning: no update had a finite gradient; the residual may be of the wrong scale")
-    info = {**policy.info, "finetuned_updates": run.update, "finetune_seed": seed}
+    if best:
+        run.network.load_state_dict(best.weights)
+    info = {**policy.info, "finetuned_updates": best.update if best else run.update, "finetune_seed": seed}
     return Policy(run.network, policy.task, info, policy.method), history
 
 
-def _judged(updates, run, judge):
-    """The metrics of each update with the time spent on training and what a judge says."""
+def _judged(updates, run, judge, best):
+    """The metrics of each update with the time spent on training, the best noted, and what a judge says."""
     seconds, begun = 0.0, time.perf_counter()
     for metrics in updates:
+        if best:
+            best(run.network, metrics["update"])
         seconds += time.perf_counter() - begun
         said = judge(run.network, metrics["update"]) if judge else {}
         yield {**metrics, "seconds": seconds, **said}
         begun = time.perf_counter()
 
 
-def learn(policy, target, samples, kind="acceleration", exploration=0.1, seed=0):
+def learn(policy, target, samples, kind=residuals.AUTO, exploration=0.1, seed=0):
     """Fly a policy in a target and fit a residual to its source: (transitions, residual, report), as `adapt` does."""
     device = next(policy.network.parameters()).device
     transitions, _ = _flown(policy, target, policy.task, samples, exploration, seed, device)
@@ -108,11 +121,12 @@ def adapt(
     plant=None,
     samples=1000,
     transitions=None,
-    kind="acceleration",
+    kind=residuals.AUTO,
     exploration=0.1,
     rounds=None,
     seed=0,
     config=None,
+    gate=True,
     oracle=False,
     episodes=None,
     watch=None,
@@ -131,11 +145,12 @@ def adapt(
         plant: a `Plant` to fly and to evaluate in instead, or `Flights` of one: its equations are not needed.
         samples: transitions to fly in the target; ignored where `transitions` are given.
         transitions: recorded `Transitions` to learn from instead.
-        kind: of the residual, "acceleration" or "state".
+        kind: of the residual, one of `adapt.residual.KINDS` or "auto".
         exploration: standard deviation of noise on the actions flown for data.
         rounds: parts that the transitions are flown in, each by the policy tuned on those before (default: 1, or 5
             for a policy that sees pictures: it knows no states but those that it was filmed in).
         config: of the fine-tuning, see `finetune`.
+        gate: return the tuned policy only where it is surely better than the given one, see `adapt.gate`.
         oracle: also fine-tune for as long in the true target, as a bound of what data could give; with several rounds,
             from the policy of the last.
         episodes: test episodes that each policy is evaluated on (default: as many as the published tables use); fewer
@@ -194,24 +209,50 @@ def adapt(
         both = (("model", source), ("model + residual", residual))
         prediction = {name: prediction_error(dynamics, held_out) for name, dynamics in both}
     # A copy: what is returned stays on the CPU, where the transitions are.
-    learned = copy.deepcopy(residual if context is None else residual.with_context(context)).to(device)
+    seeing = context is not None and residual.config.context_names
+    learned = copy.deepcopy(residual.with_context(context) if seeing else residual).to(device)
     truth = target if target is not None else learned
     judge = watch and Judge(policy, truth, seen, watch, (config or finetuning(policy)).updates)
     clock.next("finetune")
-    tuned, history = finetune(begun, learned, config, seed, progress, footage, judge)
-    keep("policy", tuned)
+    validations = VALIDATIONS if gate and not METHODS[policy.method].pixels else 0
+    tuned, history = finetune(begun, learned, config, seed, progress, footage, judge, validations)
     if judge:
         clock.move("finetune", "watch", judge.seconds)
+    chosen, verdict = tuned, None
+    if gate:
+        clock.next("gate")
+        models = {"the fit": learned} | _alternatives(policy, transitions, source, fit, context, seed, device)
+        chosen, verdict = Gate(policy, models, seen, seed).choose(tuned)
+    keep("policy", chosen)
     clock.next("evaluate")
     evaluations["zero_shot"] = evaluate(actor, truth, seen, tests)
-    evaluations["few_shot"] = evaluate(tuned.actor(seed), truth, seen, tests)
+    evaluations["few_shot"] = evaluations["zero_shot"]
+    if chosen is not policy:
+        evaluations["few_shot"] = evaluate(chosen.actor(seed), truth, seen, tests)
+    if chosen is not tuned:
+        evaluations["refused"] = evaluate(tuned.actor(seed), truth, seen, tests)
     best = None
     if oracle:
         clock.next("oracle")
         best, _ = finetune(begun, target, config, seed, progress, footage)
         evaluations["oracle"] = evaluate(best.actor(seed), target, seen, tests)
     flights = None if plant is None else target.report()
-    return Adaptation(tuned, residual, transitions, fit, evaluations, prediction, history, clock.stop(), best, flights)
+    spent = clock.stop()
+    return Adaptation(
+        chosen, residual, transitions, fit, evaluations, prediction, history, spent, best, flights, verdict
+    )
+
+
+def _alternatives(policy, transitions, source, fit, context, seed, device):
+    """Models {name: dynamics} that the data allow beside the fit: of resampled flight, and of the next best kind."""
+    if METHODS[policy.method].pixels:
+        return {}  # flights of pictures take long
+    members = fit_ensemble(transitions, source, fit.kind, MEMBERS, seed, tuple(fit.parameters))
+    models = {f"resampled flight {i + 1}": member for i, member in enumerate(members)}
+    if other := residuals.runner_up(fit):
+        models[f"kind {other}"] = residuals.fit_residual(transitions, source, other, seed)[0]
+    bound = {name: m.with_context(context) if m.config.context_names else m for name, m in models.items()}
+    return {name: model.to(device) for name, model in bound.items()}
 
 
 def _held_out(actor, target, task, episodes, seed, device):

@@ -24,7 +24,6 @@ from envs.errors import InputError
 
 RESULTS = ("config.json", "metrics.json", "policy.safetensors", "residual.safetensors", "transitions.csv", "tuning.csv")
 PICTURES = ("flight.png", "error.png", "residual.png", "training.png", "flight.mp4", "flight.gif")
-LOG_UPDATES = 600
 Repeatable = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 
 
@@ -52,17 +51,18 @@ class Options:
     """Adapt a policy that sees pictures. The residual learns from states all the same, as of motion capture."""
     set: str | None = None
     """Family of episodes (quadrotor: paper, fast, circle, lemniscate, line, hover, or a CSV of waypoints)."""
-    residual: str = "acceleration"
+    residual: str = "auto"
     """Kind of residual: parameters (refit those of the model and add drag and push; finds them in noisy states, too),
     linear, features (random Fourier), network, acceleration (linear and network), state as in the paper, or auto,
     which takes the one that predicts held-out flight best, the simplest of equals."""
+    ungated: bool = False
+    """Take the new policy even where the data leave open whether it is better than the old one."""
     exploration: float = 0.1
     """Standard deviation of noise on the actions flown for data, which span -1 to 1."""
     rounds: int | None = None
     """Parts that transitions are flown in, each by the policy tuned on those before (default: 1; 5 with --pixels)."""
     updates: int | None = None
-    """Gradient steps of the fine-tuning (default: 200; 600 with --log, as a real robot is farther from its model; 500
-    with --pixels, and a third as many after each round but the last)."""
+    """Gradient steps of the fine-tuning (default: 500; a third as many after each round but the last)."""
     episodes: int | None = None
     """Test episodes of each evaluation (default: 50; 30 for the fixed wing)."""
     oracle: bool = False
@@ -195,6 +195,7 @@ def _adapt(options, setting, policy, recorded, folder, device):
             seed=options.seed,
             config=replace(finetuning(policy), updates=updates),
             seen=setting.domain and setting.domain.seen(policy.task),
+            gate=not options.ungated,
             oracle=options.oracle,
             episodes=options.episodes,
             watch=options.watch,
@@ -209,7 +210,7 @@ def _adapt(options, setting, policy, recorded, folder, device):
 def _updates(options, policy):
     from adapt.adaptation import finetuning
 
-    return options.updates or (LOG_UPDATES if options.log else finetuning(policy).updates)
+    return options.updates or finetuning(policy).updates
 
 
 def _metrics(options, policy, adaptation, validation):
@@ -230,6 +231,8 @@ def _metrics(options, policy, adaptation, validation):
         "seconds": adaptation.seconds,
         "threads": options.threads,
     }
+    if adaptation.verdict:
+        metrics["gate"] = asdict(adaptation.verdict)
     if adaptation.flights:
         metrics["plant"] = adaptation.flights
     if recorded_only(options):
@@ -253,7 +256,7 @@ def _found(fit):
     said = {"kind": fit.kind, "inputs": fit.inputs, "network": fit.network, "warnings": fit.warnings}
     values = {name: {"value": value, "standard_error": error} for name, (value, error) in fit.parameters.items()}
     if fit.tried:
-        said["tried"] = {one.kind: one.score if one.shares is not None else one.why for one in fit.tried}
+        said["tried"] = {one.kind: one.score if one.squares is not None else one.why for one in fit.tried}
     return said | ({"parameters": values, "alike": fit.alike} if fit.kind == "parameters" else {})
 
 

@@ -169,7 +169,7 @@ def experiment(options, policy):
     unseen = record(policy, targets, UNSEEN, "validation", seed, options.exploration)
     clock.next("fit")
     source, data, held_out = Dynamics(task.system), contexts(flown, masses), contexts(unseen, masses)
-    fits = {name: fit_residual(data[name], source, seed=seed) for name in RESIDUALS}
+    fits = {name: fit_residual(data[name], source, "linear+network", seed) for name in RESIDUALS}
     dynamics = {"model": source, **{name: residual for name, (residual, _) in fits.items()}}
     seen = _seen(data["conditioned"].context, flown.pole)
     clock.next("finetune")

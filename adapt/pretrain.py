@@ -75,8 +75,8 @@ class Options:
     """Replace what the folder holds."""
     resume: bool = False
     """Continue the run in --out where it stopped."""
-    compile: bool = True
-    """Compile the dynamics and their derivative (apg, on the CPU; a C compiler does it in less than a second)."""
+    eager: bool = False
+    """Differentiate the dynamics by torch (apg) even where a C compiler could make them ten times faster."""
     device: str = "cpu"
     """Where to train: cpu, cuda."""
     threads: int = 1
@@ -189,8 +189,8 @@ def _setting(options, system, policy):
 
 
 def _compiled(options, dynamics, device):
-    """The dynamics in machine code, where that is asked for, of use and possible."""
-    if not (options.compile and options.method.startswith("apg") and device.type == "cpu"):
+    """The dynamics in machine code, where that is of use and possible."""
+    if options.eager or not (options.method.startswith("apg") and device.type == "cpu"):
         return None
     from policies.compiled_dynamics import fastest
 

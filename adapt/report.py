@@ -1,6 +1,12 @@
 """What `adapt.fewshot` prints: its metrics as tables, and what a user should not overlook in them."""
 
-NAMES = {"source": "source", "zero_shot": "zero-shot", "few_shot": "few-shot", "oracle": "oracle"}
+NAMES = {
+    "source": "source",
+    "zero_shot": "zero-shot",
+    "few_shot": "few-shot",
+    "refused": "few-shot, refused",
+    "oracle": "oracle",
+}
 UNITS = {
     "position": "position [m]",
     "velocity": "velocity [m/s]",
@@ -33,10 +39,19 @@ def table(metrics):
             rows = [(UNITS.get(row, row), *(table[row] for table in errors.values())) for row in errors["model"]]
             parts.append(tabulate(rows, (title, *errors), "simple", floatfmt=".3g"))
     parts.extend(parameter_table(metrics["residual"]))
+    if "gate" in metrics:
+        parts.append(gate_line(metrics["gate"]))
     spent = ", ".join(f"{name} {seconds:.1f}" for name, seconds in metrics["seconds"].items())
     parts.append(f"seconds ({metrics['threads']} thread{'s' * (metrics['threads'] > 1)}): {spent}")
     parts.extend(f"note: {note}" for note in (*notes(metrics), *metrics["residual"]["warnings"]))
     return "\n\n" + "\n\n".join(parts) + "\n"
+
+
+def gate_line(verdict):
+    """What the gate decided, and why."""
+    way = "" if verdict["share"] == 1 else f" {verdict['share']:.0%} of the way to"
+    done = f"gate: took{way} the new policy" if verdict["accepted"] else "gate: kept the old policy"
+    return f"{done}; {verdict['reason']}"
 
 
 def parameter_table(residual):

@@ -46,6 +46,8 @@ KINDS = {
 MENU = tuple(KINDS)  # that "auto" chooses from
 KINDS["acceleration"] = KINDS["linear+network"]  # its older name
 AUTO = "auto"
+BLIND = "linear+network"  # what "auto" takes where it can't compare
+NEARLY = 1.1  # times the error of the chosen kind that another one may have to be a rival
 
 
 @dataclass(frozen=True)
@@ -86,10 +88,11 @@ class FitReport:
     parameters: dict[str, tuple[float, float]] = field(default_factory=dict)  # fitted value and standard error
     alike: dict[str, tuple[str, ...]] = field(default_factory=dict)  # parameters that data can't tell from these
     tried: tuple[Tried, ...] = ()  # what "auto" chose from
+    solved: bool = False  # whether the choice leaves next to nothing
     warnings: tuple[str, ...] = ()
 
 
-def fit_residual(transitions, base, kind="acceleration", seed=0, settings=FitSettings(), parameters=()):
+def fit_residual(transitions, base, kind=AUTO, seed=0, settings=FitSettings(), parameters=()):
     """Learn what `base` lacks to explain the transitions.
 
     Args:
@@ -146,9 +149,24 @@ def _chosen(data, base, seed, settings, began):
             return fit(part, kind, names)[0] if names else base
         return fit(part, kind)[0]
 
-    tried, kind = choose(data, base, MENU, held_out_fit)
+    try:
+        tried, kind, solved = choose(data, base, MENU, held_out_fit)
+    except ValueError:  # no flight is long enough to predict
+        residual, report = fit(data, BLIND)
+        warning = f"flights are too short to tell which kind of residual predicts best; took {BLIND}"
+        return residual, replace(report, warnings=(*report.warnings, warning))
     residual, report = named if kind == "parameters" else fit(data, kind)
-    return residual, replace(report, tried=tried, seconds=time.perf_counter() - began)
+    return residual, replace(report, tried=tried, solved=solved, seconds=time.perf_counter() - began)
+
+
+def runner_up(report):
+    """The kind that predicted next best to the chosen one, if about as well: the data don't tell them apart."""
+    scores = {one.kind: one.score for one in report.tried}
+    others = {kind: score for kind, score in scores.items() if kind != report.kind}
+    if not others or report.solved:
+        return None
+    best = min(others, key=others.get)
+    return best if others[best] <= NEARLY * scores[report.kind] else None
 
 
 def _kind(name, parameters):

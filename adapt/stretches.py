@@ -42,11 +42,11 @@ def cut(data, length):
     Raises:
         ValueError: no flight is as long as the shortest stretch.
     """
-    chains = _chains(data)
-    length = min(length, max((last - first for first, last in chains), default=0))
+    unbroken = chains(data)
+    length = min(length, max((last - first for first, last in unbroken), default=0))
     if length < SHORTEST:
         raise ValueError(f"flights of {length} transitions without a gap, expected {SHORTEST}")
-    long = [(first, last) for first, last in chains if last - first >= length]
+    long = [(first, last) for first, last in unbroken if last - first >= length]
     starts = [min(start, last - length) for first, last in long for start in range(first, last, length)]
     rows = torch.tensor(starts)[:, None] + torch.arange(length)
     first = rows[:, 0]
@@ -55,7 +55,7 @@ def cut(data, length):
     return Stretches(measured, data.action[rows], data.trajectory[first], context)
 
 
-def _chains(data):
+def chains(data):
     """(first, last + 1) of rows that each begin where the one before ended."""
     follows = (data.next_state[:-1] == data.state[1:]).all(-1) & (data.trajectory[:-1] == data.trajectory[1:])
     breaks = [0, *((~follows).nonzero()[:, 0] + 1).tolist(), len(data)]

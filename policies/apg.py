@@ -98,7 +98,7 @@ def actor(network, task, seed=0):
 
 # The policy is trained already: no curriculum, a lower learning rate, few updates. They visit few states, so these are
 # spread by more noise than in training; without it a rare flight far from the others can get worse.
-FINETUNE = APGConfig(updates=200, learning_rate=1e-3, curriculum=0.0, warmup=0.05, exploration=0.2, episodes=1000)
+FINETUNE = APGConfig(updates=500, learning_rate=3e-3, curriculum=0.0, warmup=0.05, exploration=0.2, episodes=1000)
 
 
 def finetuning(config):

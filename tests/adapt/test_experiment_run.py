@@ -121,8 +121,9 @@ def test_a_run_in_two_processes_is_done_once(tiny, calls, tmp_path):
     assert not both[0].is_alive()
 
 
-def test_an_adaptation_reports_its_stages(monkeypatch, tmp_path):
+def test_an_adaptation_reports_its_stages(monkeypatch, tmp_path, cartpole_file):
     options = {"system": "cartpole", "target": ("push=1",), "samples": 20, "updates": 2, "watch": 1, "oracle": True}
+    options["policy"] = str(cartpole_file)
     step = Step("adapt.fewshot", {**options, "seed": "{seed}"}, "adaptation")
     monkeypatch.setitem(EXPERIMENTS, "tiny-adapt", Experiment("tiny-adapt", "check", (step,), "adaptation/tuning.csv"))
     row = runs.run("tiny-adapt", 0, tmp_path)
@@ -131,7 +132,7 @@ def test_an_adaptation_reports_its_stages(monkeypatch, tmp_path):
     assert (row["zero_shot"], row["oracle"]) == (found["zero_shot"]["mean"], found["oracle"]["mean"])
     assert row["learned_acceleration"] < row["model_acceleration"]
     points = runs.curve(tmp_path, "tiny-adapt", 0)
-    assert [(point["update"], float(point["success"]) >= 0) for point in points] == [("1", True), ("2", True)]
+    assert [point["update"] for point in points if float(point["error"]) > 0] == ["1", "2"]
     runs.step_hash.cache_clear()
 
 

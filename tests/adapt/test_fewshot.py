@@ -52,14 +52,14 @@ def no_pictures(request, monkeypatch):
 @pytest.fixture(scope="module")
 def quick(quadrotor_file):
     """Options of a small adaptation of the rough quadrotor policy."""
-    return ("--samples", "100", "--updates", "5", "--policy", str(quadrotor_file))
+    return ("--samples", "100", "--updates", "5", "--ungated", "--policy", str(quadrotor_file))
 
 
 @pytest.fixture
 def cart(cartpole_file):
     """Options of a small adaptation of the rough cart-pole policy."""
     base = ("--system", "cartpole", "--policy", cartpole_file, "--target", "drag=1")
-    return (*base, "--samples", 30, "--updates", 3)
+    return (*base, "--samples", 30, "--updates", 3, "--ungated")
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +95,18 @@ def test_the_metrics_have_the_keys_that_others_read(finished):
     model, learned = metrics["prediction"]["model"], metrics["prediction"]["model + residual"]
     assert model.keys() == learned.keys()
     assert learned["acceleration"] < 0.1 * model["acceleration"]
+
+
+def test_the_gate_says_what_it_decided_and_why(call, cartpole_file, tmp_path):
+    cart = ("--system", "cartpole", "--policy", cartpole_file, "--samples", 30, "--updates", 1, "--out", tmp_path)
+    answer = call("fewshot", *cart, "--target", "cart_mass=1.0")  # as in the model
+    assert answer.status == 0, answer
+    metrics = read(tmp_path)
+    assert not metrics["gate"]["accepted"]
+    assert f"gate: kept the old policy; {metrics['gate']['reason']}" in answer.out
+    assert metrics["few_shot"] == metrics["zero_shot"]
+    assert "few-shot, refused" in answer.out
+    assert load_policy(tmp_path / "policy.safetensors").info == load_policy(cartpole_file).info
 
 
 def test_the_table_says_what_the_metrics_say(finished):

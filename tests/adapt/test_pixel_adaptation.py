@@ -50,7 +50,9 @@ def test_it_learns_the_difference_and_tunes_a_policy_of_the_same_method(rough):
     target, seen = target_of(rough)
     config = replace(finetuning(rough), updates=5, batch=16)
     before = {name: value.clone() for name, value in rough.network.state_dict().items()}
-    result = adapt(rough, target, samples=200, exploration=0.2, config=config, seen=seen, oracle=True, rounds=2)
+    result = adapt(
+        rough, target, samples=200, exploration=0.2, config=config, seen=seen, oracle=True, rounds=2, gate=False
+    )
     assert result.policy.method == "apg-pixels"
     assert set(result.evaluations) == {"source", "zero_shot", "few_shot", "oracle"}
     assert result.prediction["model + residual"]["velocity"] < 0.3 * result.prediction["model"]["velocity"]
@@ -70,7 +72,16 @@ def test_the_target_is_seen_as_it_looks_there_and_the_source_as_it_looks_in_the_
         return whole(actor, dynamics, replace(task, steps=2), episodes[:2])
 
     monkeypatch.setattr(adaptation, "evaluate", noted)
-    adapt(rough, target, samples=60, config=replace(finetuning(rough), updates=3), seen=seen, oracle=True, rounds=1)
+    adapt(
+        rough,
+        target,
+        samples=60,
+        config=replace(finetuning(rough), updates=3),
+        seen=seen,
+        oracle=True,
+        rounds=1,
+        gate=False,
+    )
     assert shown == [(False, 1.0), (True, 0.8), (True, 0.8), (True, 0.8)]
 
 

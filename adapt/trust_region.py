@@ -1,0 +1,70 @@
+"""How far fine-tuning may carry a policy: no farther than validation approves, nor than its actions may change."""
+
+import copy
+from dataclasses import replace
+
+import torch
+
+from policies import METHODS
+from policies.evaluate import evaluate, test_episodes
+
+FARTHEST = 1.0  # [-] root mean square change of the actions, which span -1 to 1
+SHARES = (1.0, 0.5, 0.25)  # of the way that are tried, as a line search does
+
+
+class Best:
+    """Keeps the weights that fly best over validation episodes, from those of the policy as given.
+
+    Args:
+        dynamics: to fly in, those that the policy is tuned in.
+        updates: in all; it flies `times` on the way, the last time after the last update.
+    """
+
+    def __init__(self, policy, dynamics, updates, times, episodes=16):
+        self.policy, self.dynamics, self.every, self.last = policy, dynamics, max(1, updates // times), updates
+        self.episodes = test_episodes(policy.task, episodes, "validation", seed=1)  # others than the gate's
+        self.update, self.score = 0, None
+        self(policy.network, 0)
+
+    def __call__(self, network, update):
+        """Fly the network after this update, if it is its turn."""
+        if update % self.every and update != self.last:
+            return
+        actor = replace(self.policy, network=network).actor()
+        episodes = self.episodes.to(next(network.parameters()).device)
+        said = evaluate(actor, self.dynamics, self.policy.task, episodes).summary
+        score = said["success"], -said["mean"] if said["success"] else 0.0
+        if self.score is None or score > self.score:
+            self.score, self.update, self.weights = score, update, copy.deepcopy(network.state_dict())
+
+
+def part_way(old, new, share):
+    """The policy a `share` of the way from the weights of an old one to those of a new one."""
+    if share == 1:
+        return new
+    network, before = copy.deepcopy(new.network), old.network.state_dict()
+    mixed = {
+        name: torch.lerp(before[name], value, share) if value.is_floating_point() else value
+        for name, value in network.state_dict().items()
+    }
+    network.load_state_dict(mixed)
+    return replace(new, network=network, info={**new.info, "share": share})
+
+
+@torch.no_grad()
+def distance(old, new, evaluation):
+    """Root mean square difference of the actions of two policies in the states that were flown; None if they see more.
+
+    Args:
+        evaluation: `Evaluation` of the old policy's flights.
+    """
+    task = old.task
+    if METHODS[old.method].pixels or getattr(old.network.config, "memory", 0):
+        return None
+    count, steps = evaluation.actions.shape[:2]
+    states = evaluation.states[:, :-1].flatten(0, 1)
+    rows = evaluation.episodes.repeat_interleave(steps, 0)
+    step = torch.arange(steps, device=states.device).repeat(count)
+    window = task.window(states, task.reference(rows, step, states))
+    actions = [policy.network(task.observe(states), window)[:, 0] for policy in (old, new)]
+    return float((actions[0] - actions[1]).square().mean().sqrt())
