@@ -4,6 +4,7 @@ The target's equations are used for nothing but flying in it: the residual and t
 """
 
 import copy
+import math
 import time
 from dataclasses import dataclass, field, replace
 
@@ -13,6 +14,7 @@ from adapt import residual as residuals
 from adapt.bootstrap import fit_ensemble
 from adapt.flying import collect, film_transitions, filmed
 from adapt.gate import Gate, Verdict
+from adapt.mending import mended, still_true
 from adapt.plants import flights_of
 from adapt.prediction import prediction_error
 from adapt.residual_dynamics import ResidualDynamics
@@ -27,6 +29,9 @@ from policies.compiled_dynamics import fastest
 from policies.evaluate import Evaluation, evaluate, test_episodes
 
 PICTURE_ROUNDS = 5
+PARTS = 10  # that `until_known` divides the transitions into
+KNOWN = 0.01  # [-] share of the model's error below which flight is known
+FALLING = 0.9  # times the last part's share that the next one's must be at most for another flight to be worth it
 APART = 1_000  # between the seeds of the training episodes of two rounds
 VALIDATIONS = 4  # of the policy that is fine-tuned, in the fitted model
 MEMBERS = 3  # fits to resampled flight that the gate asks
@@ -124,6 +129,7 @@ def adapt(
     kind=residuals.AUTO,
     exploration=0.1,
     rounds=None,
+    until_known=False,
     seed=0,
     config=None,
     gate=True,
@@ -149,6 +155,8 @@ def adapt(
         exploration: standard deviation of noise on the actions flown for data.
         rounds: parts that the transitions are flown in, each by the policy tuned on those before (default: 1, or 5
             for a policy that sees pictures: it knows no states but those that it was filmed in).
+        until_known: fly no more parts (10 at most unless `rounds` says otherwise) once the flight just flown was
+            predicted about as well before it was learned from as the one before it; `samples` is the most then.
         config: of the fine-tuning, see `finetune`.
         gate: return the tuned policy only where it is surely better than the given one, see `adapt.gate`.
         oracle: also fine-tune for as long in the true target, as a bound of what data could give; with several rounds,
@@ -189,8 +197,10 @@ def adapt(
     if target is not None:
         if transitions is None:
             most = PICTURE_ROUNDS if METHODS[policy.method].pixels else 1
+            most = PARTS if until_known else most
             rounds = rounds or min(most, max(1, samples // residuals.MINIMUM))
             settings = {"kind": kind, "config": config or finetuning(policy), "progress": progress}
+            settings["until_known"] = until_known
             begun, transitions, footage = _collected(
                 policy, target, seen, samples, rounds, exploration, seed, device, **settings
             )
@@ -200,9 +210,15 @@ def adapt(
         if held_out is not None:
             constant = context.expand(len(held_out), -1)
             held_out = replace(held_out, context=constant, context_names=transitions.context_names)
+    transitions, notes = mended(transitions)
     keep("transitions", transitions)
     clock.next("fit")
     residual, fit = residuals.fit_residual(transitions, source, kind, seed)
+    if not fit.solved and len(newest := still_true(transitions, source, fit.kind, seed)) < len(transitions):
+        notes.append(f"older flight contradicts newer: learned from the last {len(newest)} of {len(transitions)} alone")
+        transitions = newest
+        residual, fit = residuals.fit_residual(transitions, source, kind, seed)
+    fit = replace(fit, warnings=(*notes, *fit.warnings))
     keep("residual", residual)
     prediction = {"model": fit.before, "model + residual": fit.after}
     if held_out is not None:
@@ -266,9 +282,12 @@ def _held_out(actor, target, task, episodes, seed, device):
         raise
 
 
-def _collected(policy, target, task, samples, rounds, exploration, seed, device, *, kind, config, progress):
+def _collected(
+    policy, target, task, samples, rounds, exploration, seed, device, *, kind, config, progress, until_known
+):
     """Fly, fit, tune, fly: the policy of the last round, all transitions, and all footage if it sees pictures."""
-    transitions = footage = None
+    transitions = footage = residual = None
+    source, last = Dynamics(policy.task.system), math.inf
     for number in range(rounds):
         share = samples * (number + 1) // rounds - samples * number // rounds
         try:
@@ -279,11 +298,22 @@ def _collected(policy, target, task, samples, rounds, exploration, seed, device,
             break  # a plant was given up: what it flew before is kept
         transitions = part if transitions is None else joined((transitions, part))
         footage = film if footage is None else footage.joined(film)
+        if until_known and residual is not None:
+            left = _surprise(residual, source, part)
+            if left < KNOWN or left > FALLING * last:
+                break
+            last = left
         if number + 1 < rounds:
-            residual, _ = residuals.fit_residual(transitions, Dynamics(policy.task.system), kind, seed)
+            residual, _ = residuals.fit_residual(transitions, source, kind, seed)
             briefly = replace(config, updates=max(1, config.updates // 3))
             policy, _ = finetune(policy, residual.to(device), briefly, seed, progress, footage)
     return policy, transitions, footage
+
+
+def _surprise(residual, source, part):
+    """The share [-] of the model's acceleration error that a residual leaves of flight that it has not seen."""
+    missed = [prediction_error(dynamics, part)["acceleration"] for dynamics in (residual.cpu(), source)]
+    return missed[0] / max(missed[1], 1e-12)
 
 
 def _flown(policy, target, task, samples, exploration, seed, device):

@@ -61,6 +61,9 @@ class Options:
     """Standard deviation of noise on the actions flown for data, which span -1 to 1."""
     rounds: int | None = None
     """Parts that transitions are flown in, each by the policy tuned on those before (default: 1; 5 with --pixels)."""
+    collect: bool = False
+    """Fly, fit, tune and fly again, a tenth of --samples at a time (or as --rounds says), until the validation error
+    stops falling: that of flight predicted before it was learned from."""
     updates: int | None = None
     """Gradient steps of the fine-tuning (default: 500; a third as many after each round but the last)."""
     episodes: int | None = None
@@ -146,6 +149,8 @@ def _check(options):
         raise InputError(f"--validate {both[0]}: is learned from with --log; give flights that are not")
     if options.pixels and (options.log or options.transitions):
         raise InputError("--pixels: learns from pictures, which logs and transitions don't hold; leave them out")
+    if options.collect and (options.log or options.transitions):
+        raise InputError("--collect: flies for its data; leave out --log and --transitions")
     if options.plant and (options.target or options.oracle or options.log or options.pixels):
         raise InputError("--plant: is the target, without equations; leave out --target, --oracle, --log, --pixels")
     if options.log and (options.target or options.oracle):
@@ -192,6 +197,7 @@ def _adapt(options, setting, policy, recorded, folder, device):
             kind=options.residual,
             exploration=options.exploration,
             rounds=options.rounds,
+            until_known=options.collect,
             seed=options.seed,
             config=replace(finetuning(policy), updates=updates),
             seen=setting.domain and setting.domain.seen(policy.task),

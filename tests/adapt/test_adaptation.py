@@ -10,7 +10,7 @@ from adapt import adaptation
 from adapt.adaptation import Clock, adapt, finetune
 from adapt.flying import collect
 from adapt.residual import MINIMUM
-from adapt.transitions import Transitions
+from adapt.transitions import Transitions, joined
 from envs import make_dynamics
 from envs.env import TrackingEnv
 from envs.errors import InputError
@@ -281,3 +281,17 @@ def test_to_watch_flies_validation_episodes_in_the_target(rough_cartpole, target
     unseen = rough_cartpole.task.episodes(4, "validation", 0)
     found = adaptation.evaluate(as_actor(rough_cartpole.network), target, rough_cartpole.task, unseen).summary
     assert judge(rough_cartpole.network, 10) == {"error": found["mean"], "success": found["success"]}
+
+
+def test_no_more_is_flown_once_it_is_known(rough_cartpole, target):
+    few = {"samples": 400, "config": replace(QUICK, updates=3), "gate": False, "until_known": True}
+    assert len(adapt(rough_cartpole, target, **few).transitions) == 80  # a drag is known after the first tenth
+
+
+def test_stale_flight_is_not_learned_from(rough_cartpole, target):
+    old = flown(rough_cartpole, make_dynamics("cartpole", "cart_mass=x2"), 120)
+    mixed = joined((old, flown(rough_cartpole, target, 120)))
+    result = adapt(rough_cartpole, target, transitions=mixed, config=replace(QUICK, updates=3))
+    assert len(result.transitions) == 120
+    assert "older flight contradicts newer" in result.fit.warnings[0]
+    assert result.fit.parameters["drag"][0] == pytest.approx(1.0, rel=1e-3)

@@ -1,0 +1,96 @@
+"""Recorded transitions as they should be: each once, in the order in which they were flown, and of one robot.
+
+What is recorded goes through many hands. A fit is sure of itself where rows are repeated, and blind to time where they
+are shuffled; and flight from before a change of the robot contradicts what came after it.
+"""
+
+from dataclasses import replace
+
+import torch
+
+from adapt.choose_residual import MOTION, HeldOut
+from adapt.residual import fit_residual
+from envs.errors import InputError
+
+SHORTEST = 60  # transitions that are left to learn from, at least
+CONTRADICTS = 2.0  # times the error that newer flight leaves of itself, beyond which older flight is another robot's
+
+
+def mended(transitions):
+    """The transitions without repeated rows, each flight in order of time; and notes on what was done, as sentences."""
+    rows = torch.cat((transitions.state, transitions.action, transitions.next_state), -1)
+    keys = list(zip(transitions.trajectory.tolist(), _keys(rows), strict=True))
+    first = {}
+    for number, key in enumerate(keys):
+        first.setdefault(key, number)
+    notes, kept = [], list(first.values())
+    if len(kept) < len(keys):
+        notes.append(f"{len(keys) - len(kept)} of {len(keys)} transitions were repeated rows, and left out")
+        transitions = transitions.select(torch.tensor(kept))
+    order = _in_time(transitions)
+    if order != list(range(len(order))):
+        notes.append("transitions were not in the order in which they were flown, and were put in order")
+        transitions = transitions.select(torch.tensor(order))
+    return transitions, notes
+
+
+def _keys(rows):
+    return [row.tobytes() for row in rows.cpu().numpy()]
+
+
+def _in_time(transitions):
+    """The order of rows in which each follows the one whose end it begins with, where there is one."""
+    flights = transitions.trajectory.tolist()
+    begins = {}
+    for number, key in enumerate(zip(flights, _keys(transitions.state), strict=True)):
+        begins.setdefault(key, number)
+    following = [begins.get(key) for key in zip(flights, _keys(transitions.next_state), strict=True)]
+    followers = {after for after in following if after is not None}
+    starts = [number for number in range(len(following)) if number not in followers]
+    order, seen = [], set()
+    for start in (*starts, *range(len(following))):  # circles have no start
+        while start is not None and start not in seen:
+            seen.add(start)
+            order.append(start)
+            start = following[start]
+    position = {flight: place for place, flight in enumerate(dict.fromkeys(flights))}
+    return sorted(order, key=lambda number: position[flights[number]])
+
+
+def still_true(transitions, base, kind, seed=0):
+    """The newest transitions that one residual of a kind explains; all, unless older flight contradicts newer.
+
+    The newer half is predicted by a residual fitted to the older one, and by residuals fitted to the rest of itself.
+    Where the first is far worse, the older half is left out, and what is left is asked again.
+    """
+    while len(transitions) >= 2 * SHORTEST:
+        half = len(transitions) // 2
+        older, newer = transitions.select(slice(0, half)), transitions.select(slice(half, None))
+        try:
+            if not _contradict(older, newer, base, kind, seed):
+                break
+        except (InputError, ValueError):  # too short to tell
+            break
+        transitions = newer
+    return transitions
+
+
+def _contradict(older, newer, base, kind, seed):
+    cut = len(newer) // 2
+    parts = [newer.select(slice(0, cut)), newer.select(slice(cut, None))]
+    before = fit_residual(older, base, kind, seed)[0]
+    errors = []
+    for learned, held in (parts, parts[::-1]):
+        flown = HeldOut(base, _double(held))
+        own = fit_residual(learned, base, kind, seed)[0]
+        found = [flown.missed(residual).square().mean((0, 1)) for residual in (before, own)]
+        errors.append(torch.stack([*found, flown.moved.mean(0)]))
+    by_older, by_newer, moved = torch.stack(errors).mean(0)
+    units = torch.maximum(by_newer, MOTION**2 * moved).clamp(min=1e-18)
+    return float((by_older / units).mean().sqrt()) > CONTRADICTS
+
+
+def _double(data):
+    context = None if data.context is None else data.context.double()
+    parts = {name: getattr(data, name).double() for name in ("state", "action", "next_state")}
+    return replace(data, **parts, context=context)

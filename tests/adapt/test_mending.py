@@ -1,0 +1,71 @@
+"""What went wrong with recorded transitions is found and mended, and what is right stays as it is."""
+
+import pytest
+import torch
+
+from adapt.flying import collect
+from adapt.mending import mended, still_true
+from adapt.transitions import joined
+from envs import make_dynamics
+from envs.dynamics import Dynamics
+from policies.checkpoints import load_policy
+
+
+def flown(target, n=150, seed=0, name="quadrotor"):
+    policy = load_policy(name)
+    env = make_dynamics(name, target), policy.task, policy.task.episodes(20, "train", 9 + seed)
+    return collect(policy.actor(), env, n, 0.1, torch.Generator().manual_seed(seed))
+
+
+@pytest.fixture(scope="module")
+def data():
+    return flown("drag=0.3", 250)
+
+
+def same(one, two):
+    return all(torch.equal(getattr(one, part), getattr(two, part)) for part in ("state", "action", "next_state"))
+
+
+def test_what_is_in_order_stays_as_it_is(data):
+    found, notes = mended(data)
+    assert notes == []
+    assert same(found, data)
+    assert torch.equal(found.trajectory, data.trajectory)
+
+
+def test_shuffled_flights_are_put_in_order_and_repeated_rows_are_left_out(data):
+    order = torch.randperm(len(data), generator=torch.Generator().manual_seed(0))
+    found, notes = mended(data.select(torch.cat((order, order[:40]))))
+    assert [note.split(" were")[0] for note in notes] == ["40 of 290 transitions", "transitions"]
+    for flight in data.trajectory.unique():
+        assert same(found.select(found.trajectory == flight), data.select(data.trajectory == flight))
+
+
+def test_flights_come_in_the_order_in_which_they_were_recorded(data):
+    rows = torch.arange(len(data)).flip(0)
+    found, _ = mended(data.select(rows))
+    assert found.trajectory.unique_consecutive().tolist() == data.trajectory.unique_consecutive().flip(0).tolist()
+
+
+def test_a_flight_in_a_circle_is_kept_whole():
+    data = flown("", 12)
+    ring = torch.cat((data.state[1:], data.state[:1]))
+    circle = data.select(slice(None))
+    circle.next_state[:] = ring
+    found, notes = mended(circle)
+    assert len(found) == 12
+    assert notes == []
+
+
+@pytest.mark.parametrize("noise", ["", " noise=1"])
+@pytest.mark.parametrize(("before", "left"), [("drag=0.3", 300), ("mass=x1.3", 150), ("push=1", 150)])
+def test_flight_from_before_a_change_is_left_out(noise, before, left):
+    both = joined((flown(before + noise, seed=1), flown("drag=0.3" + noise, seed=2)))
+    kept = still_true(both, Dynamics(load_policy("quadrotor").task.system), "parameters")
+    assert len(kept) == left
+    assert torch.equal(kept.state, both.state[-left:])
+
+
+def test_little_flight_is_kept_whatever_it_says(data):
+    few = joined((flown("mass=x1.3", 50, 1), flown("drag=0.3", 50, 2)))
+    assert still_true(few, Dynamics(load_policy("quadrotor").task.system), "linear") is few
