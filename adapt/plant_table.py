@@ -16,6 +16,6 @@ class Simulator:
 SIMULATORS = {
     "rotorpy": Simulator("rotorpy_quadrotor", "rotorpy", "quadrotor"),
     "drone-models": Simulator("drone_models_crazyflie", "drone_models", "quadrotor", "crazyflie"),
-    "jsbsim": Simulator("jsbsim_aircraft", "jsbsim", "fixed_wing"),
+    "jsbsim": Simulator("jsbsim_aircraft", "jsbsim", "fixed_wing", "j3cub"),
     "mujoco": Simulator("mujoco_cartpole", "mujoco", "cartpole"),
 }

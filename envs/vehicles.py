@@ -4,11 +4,12 @@
     system = "quadrotor"
     [parameters]            # fields of the system; other units of the same kind are converted
     mass = "34 g"
-    [motors]                # optional: what turns logged motor commands into thrust
+    [motors]                # optional, of a quadrotor: what turns logged motor commands into thrust
     thrust_curve = ["5.48e-4 N", "1.03e-6 N", "2.13e-11 N"]
     [sensors]               # optional: what a measurement can be at most
 
-`vehicle_data/crazyflie.toml` is a complete example and is found by its name, "crazyflie".
+`vehicle_data/crazyflie.toml` and, of a fixed wing, `j3cub.toml` are complete examples, found by their names. A field
+with several values, such as the coefficients of lift, is a list.
 """
 
 import math
@@ -18,11 +19,16 @@ from importlib import resources
 from pathlib import Path
 
 from envs.errors import InputError
+from envs.fixed_wing import FixedWing
 from envs.quadrotor import Quadrotor
+from envs.system import System
 
 CONVERSIONS = {  # {SI unit: {unit that may be given: factor}}; "g" is grams for a mass, gravities for an acceleration
     "": {"": 1.0},
     "kg": {"kg": 1.0, "g": 1e-3},
+    "kg/m^3": {"kg/m^3": 1.0, "g/m^3": 1e-3},
+    "m^2": {"m^2": 1.0, "dm^2": 1e-2, "cm^2": 1e-4},
+    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180},
     "kg m^2": {"kg m^2": 1.0, "kg mm^2": 1e-6, "kg cm^2": 1e-4, "g m^2": 1e-3, "g cm^2": 1e-7, "g mm^2": 1e-9},
     "1/s": {"1/s": 1.0, "1/ms": 1e3, "Hz": 1.0},
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
@@ -34,7 +40,7 @@ CONVERSIONS = {  # {SI unit: {unit that may be given: factor}}; "g" is grams for
     "V": {"V": 1.0, "mV": 1e-3},
 }
 
-PARAMETER_UNITS = {
+QUADROTOR_UNITS = {
     "dt": "s",
     **dict.fromkeys(("mass", "controller_mass"), "kg"),
     **{f"{owner}inertia_{axis}": "kg m^2" for owner in ("", "controller_") for axis in "xyz"},
@@ -43,9 +49,18 @@ PARAMETER_UNITS = {
     **dict.fromkeys(("gravity", "thrust_min", "thrust_max"), "m/s^2"),
     "thrust_loss": "",
 }
-# The values of another airframe are never a sensible stand-in for these.
-REQUIRED = tuple(
-    name for name in PARAMETER_UNITS if name not in ("dt", "gravity", "thrust_loss") and "controller" not in name
+FIXED_WING_UNITS = {
+    **{"dt": "s", "mass": "kg", "gravity": "m/s^2", "air_density": "kg/m^3", "wing_area": "m^2", "thrust_max": "N"},
+    **{f"inertia_{axes}": "kg m^2" for axes in ("x", "y", "z", "xz")},
+    **dict.fromkeys(("chord", "span"), "m"),
+    **{f"{part}_limit": "rad" for part in ("elevator", "aileron", "rudder", "incidence")},
+    "thrust_angle": "rad",
+    **dict.fromkeys(("lift", "drag", "pitch", "side", "roll", "yaw", "thrust_loss"), ""),
+}
+UNITS = {Quadrotor: QUADROTOR_UNITS, FixedWing: FIXED_WING_UNITS}
+# What every airframe has alike, or has no need to tell; other values of another one are never a sensible stand-in.
+OPTIONAL = ("dt", "gravity", "air_density", "incidence_limit", "thrust_loss", "controller_mass") + tuple(
+    f"controller_inertia_{axis}" for axis in "xyz"
 )
 
 
@@ -78,7 +93,7 @@ class Vehicle:
     """A robot of one's own: its model, and what is needed to read its logs."""
 
     name: str
-    system: Quadrotor
+    system: System
     motors: Motors | None = None
     sensors: Sensors = Sensors()
 
@@ -155,14 +170,20 @@ def load_vehicle(name_or_path):
 
 def _vehicle(tables, where):
     _known(tables, ("name", "system", "parameters", "motors", "sensors"), where)
-    if tables.get("system", Quadrotor.name) != Quadrotor.name:
-        raise InputError(f"{where}: system {tables['system']!r}, expected {Quadrotor.name!r}")
+    kinds = {kind.name: kind for kind in UNITS}
+    if (kind := kinds.get(found := tables.get("system", Quadrotor.name))) is None:
+        raise InputError(f"{where}: system {found!r}, expected {' or '.join(repr(name) for name in kinds)}")
     name = tables.get("name", Path(where).stem)
     if not isinstance(name, str) or not name:
         raise InputError(f"{where}: name {name!r}, expected a word")
-    parameters = _values(tables, "parameters", PARAMETER_UNITS, REQUIRED, where)
+    if "motors" in tables and kind is not Quadrotor:
+        raise InputError(f"{where}: [motors] are those of a {Quadrotor.name}, this is a {kind.name}; leave them out")
+    units = UNITS[kind]
+    series = {field: len(default) for field in units if isinstance(default := getattr(kind, field), tuple)}
+    required = [field for field in units if field not in OPTIONAL]
+    parameters = _values(tables, "parameters", units, required, where, series)
     try:
-        system = Quadrotor(**parameters)
+        system = kind(**parameters)
     except InputError as error:
         raise InputError(f"{where}: [parameters] {error}") from None
     motors = _motors(tables, where) if "motors" in tables else None
@@ -170,8 +191,7 @@ def _vehicle(tables, where):
 
 
 def _motors(tables, where):
-    values = _values(tables, "motors", MOTOR_UNITS, _required(Motors), where)
-    motors = Motors(**{**values, "thrust_curve": _tuple(values["thrust_curve"])})
+    motors = Motors(**_values(tables, "motors", MOTOR_UNITS, _required(Motors), where, {"thrust_curve": None}))
     if not motors.command_min < motors.command_max:
         low, high = motors.command_min, motors.command_max
         raise InputError(f"{where}: [motors] command_min {low:g} is not below command_max {high:g}")
@@ -193,8 +213,12 @@ def _sensors(tables, where):
     return sensors
 
 
-def _values(tables, table, units, required, where):
-    """The quantities of one table in SI units, as keyword arguments."""
+def _values(tables, table, units, required, where, series=()):
+    """The quantities of one table in SI units, as keyword arguments.
+
+    Args:
+        series: {field: how many values it has, or None if that is open} of the fields that are lists.
+    """
     given = tables.get(table, {})
     where = f"{where}: [{table}]"
     if not isinstance(given, dict):
@@ -205,13 +229,20 @@ def _values(tables, table, units, required, where):
     values = {}
     for name, text in given.items():
         place = f"{where} {name}"
-        if isinstance(text, list):
-            values[name] = tuple(quantity(entry, units[name], place) for entry in text)
+        if name in series:
+            values[name] = _series(text, units[name], place, series[name])
+        elif isinstance(text, list):
+            raise InputError(f"{place}: a list, expected one value")
         else:
             values[name] = quantity(text, units[name], place)
-    scalars = [name for name, value in values.items() if isinstance(value, tuple) and name != "thrust_curve"]
-    if scalars:
-        raise InputError(f"{where} {scalars[0]}: a list, expected one value")
+    return values
+
+
+def _series(entries, unit, where, count):
+    """The values of a list, which may be written without brackets if it is one value."""
+    values = tuple(quantity(entry, unit, where) for entry in (entries if isinstance(entries, list) else [entries]))
+    if count is not None and len(values) != count:
+        raise InputError(f"{where}: {len(values)} values, expected {count}")
     return values
 
 
@@ -222,7 +253,3 @@ def _known(given, names, where):
 
 def _required(kind):
     return [field.name for field in fields(kind) if field.default is MISSING]
-
-
-def _tuple(value):
-    return value if isinstance(value, tuple) else (value,)

@@ -1,11 +1,12 @@
 """A Crazyflie of drone-models (Learning Systems and Robotics Lab, TU Munich), fitted on real flights.
 
-Its rigid body has measured thrust and torque curves, rotors that take 0.1 s to follow, and a drag that was fitted on
-real flights. Our rate controller runs at its own rate above the published curves and is configured with the published
-mass and inertia; what is left to learn is the drag and what the slow rotors do.
+Its rigid body has measured thrust and torque curves, a drag fitted on real flights, and rotors that take 0.1 s to
+follow. Our rate controller runs at 500 Hz, as a firmware does, and leads the rotors: by their published law they get
+the command that brings them to the wanted speed with a lag of `LAG`, as far as a motor can. What is left to learn is
+the drag, what is left of the lag, and motors at their limits.
 
-The attitude is integrated here: the rate of the quaternion that drone-models 0.1 gives is that of one with the scalar
-first, while it takes one with the scalar last, and it says itself that only the angular velocity is to be used.
+The attitude is integrated here: drone-models 0.1 takes a quaternion with the scalar last and gives the rate of one with
+the scalar first; it says itself that only the angular velocity is to be used.
 """
 
 import os
@@ -17,28 +18,26 @@ os.environ.setdefault("SCIPY_ARRAY_API", "1")  # drone-models refuses to be impo
 from drone_models.core import load_params, parametrize
 from drone_models.first_principles import dynamics
 
-from adapt.simulators.rate_control import RateControl
+from adapt.simulators.rate_control import RateControl, lead
 from envs.rigid_body import quaternion_rates
 
 SUBSTEPS = 50  # of the rate controller, and of the integration, in a control period
+LAG = 0.02  # [s] lag that is left of the rotors
 
 
 class DroneModelsCrazyflie:
-    """Plant of a `Quadrotor`; the speeds of the rotors are beyond its state.
-
-    Args:
-        system: `Quadrotor` with gains and limits.
-        drone: which of the airframes of drone-models.
-    """
+    """Plant of a `Quadrotor`; `drone` is an airframe of drone-models. The rotors' speeds are beyond its state."""
 
     def __init__(self, system, drone="cf2x_L250"):
         self.dt, published = system.dt, load_params("first_principles", drone)
         self.rates = parametrize(dynamics, drone)
         self.control = RateControl(system, published["mass"], published["J"])
-        self.thrust, self.limits = published["rpm2thrust"], (published["thrust_min"], published["thrust_max"])
+        self.law, self.thrust = published["rotor_dyn_coef"], published["rpm2thrust"]
+        self.limits = np.array((published["thrust_min"], published["thrust_max"]))
         arms = published["L"] * published["mixing_matrix"][:2]
         yaw = published["thrust2torque"] * published["mixing_matrix"][2:]
         self.mixing = np.linalg.inv(np.vstack((np.ones(4), arms, yaw)))
+        self.range = self._speeds(self.limits)
         self.hover = self._speeds(np.full(4, -published["mass"] * published["gravity_vec"][2] / 4))
 
     def _speeds(self, forces):
@@ -57,8 +56,8 @@ class DroneModelsCrazyflie:
         for _ in range(SUBSTEPS):
             position, attitude, velocity, rates, rotors = self.now
             wrench = (self.control.force(action), *self.control.torque(rates, action))
-            body = (position, np.roll(attitude, -1), velocity, rates)  # the scalar last
-            changes = list(self.rates(*body, self._speeds(self.mixing @ wrench), rotors))
+            command = lead(self._speeds(self.mixing @ wrench), rotors, self.law, LAG).clip(*self.range)
+            changes = list(self.rates(position, np.roll(attitude, -1), velocity, rates, command, rotors))
             changes[1] = np.array(quaternion_rates(attitude, rates))
             self.now = [a + self.dt / SUBSTEPS * b for a, b in zip(self.now, changes, strict=True)]
             self.now[1] = self.now[1] / np.linalg.norm(self.now[1])

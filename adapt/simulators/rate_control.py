@@ -1,4 +1,4 @@
-"""The low-level controller of a quadrotor: collective thrust and body rates, as a policy commands them, to a wrench."""
+"""The low-level controller of a quadrotor: from collective thrust and body rates, as commanded, to the rotors."""
 
 import numpy as np
 
@@ -26,3 +26,19 @@ class RateControl:
         """Torque (3,) [N m] at body rates (3,): J K (w_des - w) + w x J w."""
         wanted = self.gains * (self.limits * action[1:] - rates)
         return self.inertia @ wanted + np.cross(rates, self.inertia @ rates)
+
+
+def lead(wanted, speeds, law, lag):
+    """The command that brings slow rotors to the wanted speeds with a lag [s] of one's choice; inverts their law.
+
+    They follow a command c by a (c - s) + b (c^2 - s^2), with other a and b upwards than downwards; this is set to
+    (wanted - s) / lag and solved for c. What a motor can't take is left to the caller to cut off.
+
+    Args:
+        wanted, speeds: (r,) of the rotors, as the command.
+        law: (4,) a and b upwards, a and b downwards, in 1/s and 1/s over the unit of a speed.
+    """
+    change = (wanted - speeds) / lag
+    a, b = np.where(change > 0, law[:2, None], law[2:, None])
+    sought = np.maximum(a * speeds + b * speeds**2 + change, 1e-6)  # no command is below a stand-still
+    return 2 * sought / (a + np.sqrt(a**2 + 4 * b * sought))
