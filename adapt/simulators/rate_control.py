@@ -35,7 +35,8 @@ def lead(wanted, speeds, law, lag):
     (wanted - s) / lag and solved for c. What a motor can't take is left to the caller to cut off.
 
     Args:
-        wanted, speeds: (r,) of the rotors, as the command.
+        wanted: (r,) speeds of the rotors that are sought.
+        speeds: (r,) that they have, in the same unit as the command.
         law: (4,) a and b upwards, a and b downwards, in 1/s and 1/s over the unit of a speed.
     """
     change = (wanted - speeds) / lag
