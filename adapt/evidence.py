@@ -57,7 +57,7 @@ SHARE, PERHAPS_SHARE = Column(0, 1), Column(0, 1, gaps=True)
 ROW = {"experiment": NAME, "seed": COUNT, "system": NAME, "set": TEXT, "target": TEXT, "method": NAME, "horizon": TEXT}
 ROW |= {"mode": TEXT, "samples": SIZE, "metric": NAME, "unit": NAME, "error": SIZE, "std": SIZE, "success": SHARE}
 ROW |= {"n": Column(1, whole=True)}
-FURTHER = dict.fromkeys(("zero_shot", "oracle", "model_acceleration", "learned_acceleration"), SIZE)
+FURTHER = dict.fromkeys(("source", "zero_shot", "oracle", "model_acceleration", "learned_acceleration"), SIZE)
 FURTHER |= dict.fromkeys(("median_ms", "p99_ms", "gradient_norm", "gradient_variance", "seconds", "wall_s"), SIZE)
 FURTHER |= dict.fromkeys(("threads", "python", "torch", "torchrl", "tensordict", "casadi", "commit", "config"), TEXT)
 CURVE = {"experiment": NAME, "seed": COUNT, "update": COUNT, "samples": SIZE, "seconds": SIZE, "error": SIZE}

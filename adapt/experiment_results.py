@@ -8,8 +8,17 @@ from adapt.experiment_table import EXPERIMENTS
 from envs.errors import InputError
 from policies.files import replacing
 
-FIGURES = ("error", "std", "success", "n", "zero_shot", "oracle", "model_acceleration", "learned_acceleration")
-FIGURES += ("median_ms", "p99_ms", "gradient_norm", "gradient_variance", "seconds", "wall_s")
+FIGURES = ("error", "std", "success", "n", "source", "zero_shot", "oracle")
+FIGURES += (
+    "model_acceleration",
+    "learned_acceleration",
+    "median_ms",
+    "p99_ms",
+    "gradient_norm",
+    "gradient_variance",
+    "seconds",
+    "wall_s",
+)
 COLUMNS = ("experiment", "seed", "system", "set", "target", "method", "horizon", "mode", "samples", "metric", "unit")
 COLUMNS += (*FIGURES, "threads", *VERSIONS, "commit", "config")
 KEY = ["experiment", "seed"]

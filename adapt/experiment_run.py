@@ -231,7 +231,7 @@ def _evaluation(found):
 
 def _adaptation(found):
     row = {"method": found["method"], "samples": found["samples"], **_figures(found["few_shot"])}
-    row |= {key: found[key]["mean"] for key in ("zero_shot", "oracle") if key in found}
+    row |= {key: found[key]["mean"] for key in ("source", "zero_shot", "oracle") if key in found}
     row |= {"model_acceleration": found["prediction"]["model"]["acceleration"]}
     row |= {"learned_acceleration": found["prediction"]["model + residual"]["acceleration"]}
     spent = sum(found["seconds"][stage] for stage in ("collect", "fit", "finetune"))

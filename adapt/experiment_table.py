@@ -18,6 +18,20 @@ LONGEST = HORIZONS[-1]  # whose test paths all horizons fly
 # Transitions in the target: the paper's budgets, and few.
 BUDGETS = {"quadrotor": (30, 100, 300, 1000), "fixed_wing": (30, 100, 300, 1000, 2000, 5000)}
 PPO_BUDGETS = {"quadrotor": (30, 100, 300, 1000, 5000), "fixed_wing": (30, 100, 300, 1000, 2000, 5000)}
+# Other targets than the paper's drag: what changes, and how it is called.
+CHANGES = {
+    "drag": ("drag=0.3",),
+    "push": ("push=0.5",),
+    "wind": ("wind=3",),
+    "mass": ("mass=x1.3",),
+    "thrust": ("thrust_loss=0.15",),
+    "quadratic": ("quadratic_drag=0.1",),
+    "all": ("push=0.3", "wind=2", "mass=x1.2", "thrust_loss=0.1", "quadratic_drag=0.05", "drag=0.2"),
+}
+FEWEST = (30, 100, 1000)  # transitions in drag beside `FEW`
+FEW, NOISY = 300, 1000  # transitions in other targets, and where sensors err
+KINDS_TRIED = ("parameters", "linear", "features", "network", "linear+network", "state")
+SIMULATED = {"rotorpy": 5, "drone-models": 20, "jsbsim": 30, "mujoco": 20}  # test flights, fewer where flying is slow
 MANY = 150_000
 MOST_SEEDS = 10_000
 # What 150 000 transitions of the fixed wing are best used with, found on validation episodes: it has to learn to hold
@@ -177,6 +191,33 @@ def _in_residual(system):
     return Experiment(f"drag-ppo-{system}-residual", f"table4-{system}", (learn, flown))
 
 
+def in_other_targets():
+    """Other targets, exact and through sensors that err, and in each every kind of residual that could be chosen."""
+    for system in AIRCRAFT:
+        for samples in FEWEST:
+            yield in_target(f"target-drag-{system}-{samples}", "targets", system, DRAG, samples)
+        for change, target in CHANGES.items():
+            yield in_target(f"target-{change}-{system}-{FEW}", "targets", system, target, FEW)
+            noisy = (*target, "noise=1")
+            yield in_target(f"target-{change}-noisy-{system}-{NOISY}", "targets", system, noisy, NOISY)
+            for kind in KINDS_TRIED:
+                named = {"residual": kind, "ungated": True, "oracle": False}
+                yield in_target(f"kinds-{change}-{system}-{kind}", "kinds", system, target, FEW, **named)
+
+
+def in_target(name, table, system, target, samples, **options):
+    """Adapt the policy that ships to a target, and to its equations as a bound."""
+    options = {"system": system, "target": target, "samples": samples, "oracle": True, **options, "seed": "{seed}"}
+    return Experiment(name, table, (Step("adapt.fewshot", options, "adaptation"),))
+
+
+def in_simulators():
+    """Third-party simulators; each has to be installed."""
+    for plant, flights in SIMULATED.items():
+        options = {"plant": plant, "samples": FEW, "episodes": flights, "seed": "{seed}"}
+        yield Experiment(f"simulator-{plant}", "simulators", (Step("adapt.fewshot", options, "adaptation"),))
+
+
 def to_check():
     """Two quick runs, evidence of nothing: to see that a machine, or a cluster, carries out runs and what they need."""
     yield trained("check-train", "check", "cartpole", updates=200, every=50)
@@ -192,7 +233,16 @@ def to_check():
 
 EXPERIMENTS = {
     experiment.name: experiment
-    for part in (to_check, in_the_model, by_horizon, by_curriculum, from_pictures, in_drag)
+    for part in (
+        to_check,
+        in_the_model,
+        by_horizon,
+        by_curriculum,
+        from_pictures,
+        in_drag,
+        in_other_targets,
+        in_simulators,
+    )
     for experiment in part()
 }
 TABLES = tuple(dict.fromkeys(experiment.table for experiment in EXPERIMENTS.values()))

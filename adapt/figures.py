@@ -36,7 +36,7 @@ from adapt.figure_parts import (
     published,
 )
 from adapt.plots import DPI, GREY, STYLE
-from adapt.table_layouts import METHODS, MODE_NAMES
+from adapt.table_cells import METHODS, MODE_NAMES
 from envs.errors import InputError
 from policies.files import replacing
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from adapt import command
-from adapt.table_layouts import HOW, LAYOUTS
+from adapt.table_cells import HOW
+from adapt.table_layouts import LAYOUTS
 from envs.errors import InputError
 from policies.files import replacing
 

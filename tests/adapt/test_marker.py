@@ -43,7 +43,8 @@ def recordings(policy, targets):
 @pytest.fixture(scope="module")
 def residuals(policy, recordings):
     data = marker.contexts(recordings[0], MASSES)
-    return {name: fit_residual(data[name], Dynamics(policy.task.system), "linear+network")[0] for name in marker.RESIDUALS}
+    source = Dynamics(policy.task.system)
+    return {name: fit_residual(data[name], source, "linear+network")[0] for name in marker.RESIDUALS}
 
 
 @pytest.fixture(scope="module")

@@ -6,12 +6,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from adapt import evidence, table_layouts
+from adapt import evidence, table_cells
 from adapt.experiment_table import EXPERIMENTS
 from adapt.table_layouts import LAYOUTS
 
 PUBLISHED = Path(__file__).parents[2] / "results" / "published.csv"
-NUMBERS = ("zero_shot", "oracle", "median_ms", "samples")
+NUMBERS = ("source", "zero_shot", "oracle", "median_ms", "samples", "n")
 
 
 def known(*runs):
@@ -54,12 +54,12 @@ def cells(found, table, *row):
     ],
 )
 def test_a_cell_is_the_mean_over_seeds_with_its_spread_and_the_share_that_succeeds(errors, success, said):
-    assert table_layouts.ours(known(("apg-cartpole", errors, {"success": success})), "apg-cartpole") == said
+    assert table_cells.ours(known(("apg-cartpole", errors, {"success": success})), "apg-cartpole") == said
 
 
 def test_a_seed_that_fails_is_told_beside_the_mean_of_the_others():
     found = known(("apg-cartpole", (0.04, math.nan, 0.02, 0.03)))
-    assert table_layouts.ours(found, "apg-cartpole") == "0.0300 ± 0.0082 (75 %, 1 of 4 seeds fail)"
+    assert table_cells.ours(found, "apg-cartpole") == "0.0300 ± 0.0082 (75 %, 1 of 4 seeds fail)"
 
 
 def test_without_results_every_cell_of_ours_is_a_dash_and_the_published_values_stand():
@@ -96,7 +96,7 @@ def test_budgets_and_seeds_that_differ_within_a_row_are_all_told():
     [(30, "30"), (9999, "9999"), (149_504, "150 k"), (999_499, "999 k"), (999_500, "1 M"), (5_120_000, "5.12 M")],
 )
 def test_numbers_of_transitions_are_short(number, said):
-    assert table_layouts.count(number) == said
+    assert table_cells.count(number) == said
 
 
 @pytest.mark.parametrize(
