@@ -13,13 +13,14 @@ import torch
 from adapt import residual as residuals
 from adapt.bootstrap import fit_ensemble
 from adapt.flying import collect, film_transitions, filmed
-from adapt.gate import Gate, Verdict
+from adapt.gate import UNCHANGED, Gate, Verdict
+from adapt.labelling import check_labels
 from adapt.mending import mended, still_true
 from adapt.plants import flights_of
 from adapt.prediction import prediction_error
 from adapt.residual_dynamics import ResidualDynamics
 from adapt.transitions import Transitions, joined
-from adapt.trust_region import Best
+from adapt.trust_region import Best, same_weights
 from envs.dynamics import Dynamics
 from envs.errors import InputError
 from envs.pixels import tracking_env
@@ -173,8 +174,9 @@ def adapt(
         keep: called with "transitions", "residual" and "policy" and the result, as soon as each exists.
 
     Raises:
-        InputError: when there is neither target nor transitions, the transitions don't fit the policy's robot, or a
-            plant has other states or another control period, or gives nothing to learn from.
+        InputError: when there is neither target nor transitions, the transitions don't fit the policy's robot, their
+            actions are swapped or shifted (`adapt.labelling`), or a plant has other states or another control period,
+            or gives nothing to learn from.
     """
     if plant is not None:
         target = flights_of(plant, policy, target, oracle)
@@ -202,7 +204,7 @@ def adapt(
             settings = {"kind": kind, "config": config or finetuning(policy), "progress": progress}
             settings["until_known"] = until_known
             begun, transitions, footage = _collected(
-                policy, target, seen, samples, rounds, exploration, seed, device, **settings
+                policy, target, seen, samples, rounds, exploration, seed, device, keep, **settings
             )
         held_out = _held_out(actor, target, seen, len(tests), seed, device)
     if transitions.context is not None:
@@ -212,6 +214,8 @@ def adapt(
             held_out = replace(held_out, context=constant, context_names=transitions.context_names)
     transitions, notes = mended(transitions)
     keep("transitions", transitions)
+    _check_flown(target, transitions)
+    check_labels(transitions, source)
     clock.next("fit")
     residual, fit = residuals.fit_residual(transitions, source, kind, seed)
     if not fit.solved and len(newest := still_true(transitions, source, fit.kind, seed)) < len(transitions):
@@ -237,8 +241,10 @@ def adapt(
     chosen, verdict = tuned, None
     if gate:
         clock.next("gate")
-        models = {"the fit": learned} | _alternatives(policy, transitions, source, fit, context, seed, device)
-        chosen, verdict = Gate(policy, models, seen, seed).choose(tuned)
+        chosen, verdict = policy, UNCHANGED
+        if not same_weights(policy, tuned):
+            models = {"the fit": learned} | _alternatives(policy, transitions, source, fit, context, seed, device)
+            chosen, verdict = Gate(policy, models, seen, seed).choose(tuned)
     keep("policy", chosen)
     clock.next("evaluate")
     evaluations["zero_shot"] = evaluate(actor, truth, seen, tests)
@@ -283,9 +289,12 @@ def _held_out(actor, target, task, episodes, seed, device):
 
 
 def _collected(
-    policy, target, task, samples, rounds, exploration, seed, device, *, kind, config, progress, until_known
+    policy, target, task, samples, rounds, exploration, seed, device, keep, *, kind, config, progress, until_known
 ):
-    """Fly, fit, tune, fly: the policy of the last round, all transitions, and all footage if it sees pictures."""
+    """Fly, fit, tune, fly: the policy of the last round, all transitions, and all footage if it sees pictures.
+
+    What was flown is kept before it is learned from, so that it outlives a fit that fails.
+    """
     transitions = footage = residual = None
     source, last = Dynamics(policy.task.system), math.inf
     for number in range(rounds):
@@ -303,11 +312,20 @@ def _collected(
             if left < KNOWN or left > FALLING * last:
                 break
             last = left
-        if number + 1 < rounds:
-            residual, _ = residuals.fit_residual(transitions, source, kind, seed)
-            briefly = replace(config, updates=max(1, config.updates // 3))
-            policy, _ = finetune(policy, residual.to(device), briefly, seed, progress, footage)
+        if number + 1 == rounds or getattr(target, "lost", False):  # a plant may be given up in any part
+            break
+        keep("transitions", transitions)
+        residual, _ = residuals.fit_residual(transitions, source, kind, seed)
+        briefly = replace(config, updates=max(1, config.updates // 3))
+        policy, _ = finetune(policy, residual.to(device), briefly, seed, progress, footage)
     return policy, transitions, footage
+
+
+def _check_flown(target, transitions):
+    """Refuse what a plant flew before it was given up where that is too little to learn from."""
+    if getattr(target, "lost", False) and len(transitions) < residuals.MINIMUM:
+        flown, why = f"{len(transitions)} transitions", target.faults[0]
+        raise InputError(f"{target.name}: was given up after {flown} ({why}); at least {residuals.MINIMUM} are needed")
 
 
 def _surprise(residual, source, part):

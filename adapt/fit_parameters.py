@@ -24,6 +24,7 @@ ALIKE = 0.999  # [-] correlation of two parameters' effects beyond which data ca
 NOTICEABLE = 1e-3  # [-] change of a parameter, in its size, that is worth a name
 ENOUGH = 5  # transitions for each parameter
 WORTH = 1e-3  # [-] share of what is left that a parameter must explain
+BLIND = 1e-9  # [-] square of an effect below which there is none
 EXPLAINED = 10 * NEGLIGIBLE  # [m/s^2, rad/s^2] what may be left where states are exact
 
 
@@ -43,10 +44,11 @@ def fit_parameters(residual, data, train, held, settings, generator):
     _set(residual, found)
     after = prediction_error(residual, held)
     loss = _loss(residual.base, data, bool(found.noise))
-    found = replace(settle(loss, tuple(found.values), found.values), alike=found.alike)
+    again = settle(loss, tuple(found.values), found.values)  # None where the held-out flight contradicts the others
+    found = found if again is None else replace(again, alike=found.alike)
     _set(residual, found)
     values = {name: (found.values[name], found.errors[name]) for name in found.values}
-    return {"parameters": values, "alike": found.alike}, after
+    return {"parameters": values, "alike": _undoing(loss, found)}, after
 
 
 def _set(residual, found):
@@ -136,7 +138,7 @@ def undetermined(effects, names):
 def _next(names, effects, left):
     """The parameter whose effect explains most of what is left, of equals the first; or None."""
     squares = effects.square().sum(0)
-    gains = torch.where(squares > 1e-9, (left @ effects).square() / squares.clamp(min=1e-12), 0.0)
+    gains = torch.where(squares > BLIND, (left @ effects).square() / squares.clamp(min=1e-12), 0.0)
     if not names or not float(gains.max()) > 0:
         return None
     return names[int((gains >= ALIKE * gains.max()).to(torch.int8).argmax())]
@@ -158,6 +160,29 @@ def _alike(best, names, effects):
     unit = effects / effects.norm(dim=0).clamp(min=1e-12)
     likeness = (unit.T @ unit[:, names.index(best)]).abs().tolist()
     return tuple(name for name, value in zip(names, likeness, strict=True) if value > ALIKE and name != best)
+
+
+def _undoing(loss, found):
+    """{name: {other: amount}}: for each parameter, those that the data can't tell from it and how much undoes +1 of it.
+
+    +1 of the parameter with that amount of the other, each in its unit, is a direction in parameter space that the data
+    don't determine. The amount is None where that doesn't hold at the fitted values any more.
+    """
+    return {name: _amounts(loss, found, name, others) for name, others in found.alike.items()}
+
+
+def _amounts(loss, found, name, others):
+    rest = tuple(fitted for fitted in found.values if fitted != name)
+    _, effects = loss.linearised(found.values, (*rest, name, *others))
+    own, both = effects[:, : len(rest)], effects[:, len(rest) :]
+    own_effect, *theirs = apart(both, own).T
+    amounts = {}
+    for other, effect in zip(others, theirs, strict=True):
+        square, shared = float(effect @ effect), float(effect @ own_effect)
+        same = square > BLIND and abs(shared) > ALIKE * square**0.5 * float(own_effect.norm())
+        sizes = [size(loss.base.system, one) for one in (other, name)]
+        amounts[other] = -shared / square * sizes[0] / sizes[1] if same else None
+    return amounts
 
 
 def settle(loss, names, start):

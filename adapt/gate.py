@@ -65,6 +65,10 @@ class Verdict:
     distance: float | None = None  # [-] root mean square change of the actions, which span -1 to 1
 
 
+# Where fine-tuning has led nowhere there is nothing to fly.
+UNCHANGED = Verdict(False, "fine-tuning found nothing that flies better in the fitted model", 0.0, 0.0, {}, distance=0.0)
+
+
 class Gate:
     """Flies policies against an old one in models {name: dynamics}; what the old one does is flown once.
 

@@ -38,6 +38,12 @@ class Best:
             self.score, self.update, self.weights = score, update, copy.deepcopy(network.state_dict())
 
 
+def same_weights(old, new):
+    """Whether two policies of one form have the same weights."""
+    weights = new.network.state_dict()
+    return all(torch.equal(value, weights[name]) for name, value in old.network.state_dict().items())
+
+
 def part_way(old, new, share):
     """The policy a `share` of the way from the weights of an old one to those of a new one."""
     if share == 1:

@@ -130,6 +130,8 @@ def test_where_nothing_differs_the_given_policy_is_kept(rough_cartpole):
     tuned = adapt(rough_cartpole, make_dynamics("cartpole"), samples=60, config=replace(QUICK, updates=1))
     assert tuned.policy is rough_cartpole
     assert not tuned.verdict.accepted
+    assert tuned.verdict.reason == "fine-tuning found nothing that flies better in the fitted model"
+    assert tuned.verdict.models == {}
     assert tuned.evaluations["few_shot"] is tuned.evaluations["zero_shot"]
     without = adapt(rough_cartpole, make_dynamics("cartpole"), samples=60, config=replace(QUICK, updates=1), gate=False)
     assert without.verdict is None
@@ -252,7 +254,8 @@ def test_a_stage_that_comes_back_goes_on_counting():
 @pytest.mark.slow
 def test_a_quadrotor_learns_a_drag_from_ten_seconds_of_flight(rough_quadrotor):
     target = make_dynamics("quadrotor", "drag=0.6")
-    result = adapt(rough_quadrotor, target, samples=100, config=replace(QUICK, updates=100), oracle=True)
+    settings = {"config": replace(QUICK, updates=100), "oracle": True, "gate": False}  # a rough policy still crashes
+    result = adapt(rough_quadrotor, target, samples=100, **settings)
     assert isinstance(result.transitions, Transitions)
     assert mean(result, "few_shot") < 0.7 * mean(result, "zero_shot")
     assert mean(result, "few_shot") < 1.25 * mean(result, "oracle")

@@ -1,0 +1,69 @@
+"""Actions whose columns, signs or times are wrong are refused, whatever differs in the target; right ones are not."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from adapt.flying import collect
+from adapt.labelling import check_labels
+from adapt.transitions import joined
+from envs.dynamics import Dynamics
+from envs.errors import InputError
+from envs.registry import make_dynamics
+from policies.checkpoints import load_policy
+
+TARGETS = {
+    "quadrotor": ("", "drag=0.5", "mass=x1.5 push=1,0,0", "noise=1"),
+    "fixed_wing": ("", "quadratic_drag=0.2", "thrust_loss=0.4"),
+    "cartpole": ("", "track_friction=0.2", "force_limit=x0.6"),
+}
+
+
+def flown(system, target="", samples=200):
+    """Transitions of the shipped policy, in two flights, and the source."""
+    policy, dynamics = load_policy(system), make_dynamics(system, target)
+    parts = []
+    for seed in (0, 1):
+        episodes, generator = policy.task.episodes(20, "train", seed), torch.Generator().manual_seed(seed)
+        flight = (dynamics, policy.task, episodes)
+        parts.append(collect(policy.actor(seed), flight, samples // 2, 0.1, generator))
+    return joined(parts), Dynamics(policy.task.system)
+
+
+@pytest.mark.parametrize(("system", "target"), [(name, target) for name, all_ in TARGETS.items() for target in all_])
+def test_what_was_recorded_rightly_is_taken(system, target):
+    check_labels(*flown(system, target))
+
+
+@pytest.mark.parametrize("samples", [10, 200])
+def test_swapped_actions_are_named(samples):
+    data, source = flown("quadrotor", "drag=0.3", samples)
+    with pytest.raises(InputError, match="with p_des and r_des swapped"):
+        check_labels(replace(data, action=data.action[:, [0, 3, 2, 1]]), source)
+
+
+@pytest.mark.parametrize(("system", "column", "name"), [("cartpole", 0, "force"), ("fixed_wing", 1, "elevator")])
+def test_a_turned_sign_is_named(system, column, name):
+    data, source = flown(system)
+    turned = data.action.clone()
+    turned[:, column] *= -1
+    with pytest.raises(InputError, match=f"with the sign of {name} turned"):
+        check_labels(replace(data, action=turned), source)
+
+
+@pytest.mark.parametrize(("shift", "words"), [(1, "earlier"), (-1, "later")])
+def test_actions_recorded_a_period_off_are_told(shift, words):
+    data, source = flown("quadrotor", "drag=0.3")
+    inner = slice(1, 99)  # of the first flight
+    shifted = replace(data.select(inner), action=data.action.roll(shift, 0)[inner])
+    with pytest.raises(InputError, match=f"with each action one control period {words}"):
+        check_labels(shifted, source)
+
+
+def test_a_shift_is_sought_within_flights_only():
+    """Where nothing says what came before, nothing says that it was recorded at another time."""
+    data, source = flown("quadrotor", "drag=0.3")
+    inner = slice(1, 99)
+    apart = replace(data.select(inner), action=data.action.roll(1, 0)[inner], trajectory=torch.arange(98))
+    check_labels(apart, source)
