@@ -152,6 +152,13 @@ def by_curriculum():
         yield trained(f"curriculum-{name}", "curriculum", "quadrotor", updates=1000, every=50, **change)
 
 
+def by_build():
+    """The speed figure: the first updates with compiled dynamics, and without."""
+    for system in AIRCRAFT:
+        for build, change in {"compiled": {}, "eager": {"eager": True}}.items():
+            yield trained(f"speed-{build}-{system}", "speed", system, updates=400, every=20, **change)
+
+
 def from_pictures():
     """Table III, and the adaptation of a policy that sees pictures."""
     for method, samples in {"apg": 1000, "ppo": 150_000, "mpc": 1000}.items():

@@ -12,6 +12,7 @@ BLUE, ORANGE, GREEN, PINK = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 MODE_LOOK = dict(zip(MODES, ((BLUE, "o"), (ORANGE, "s"), (GREEN, "D")), strict=True))
 METHOD_LOOK = {"apg": (BLUE, "o"), "ppo": (ORANGE, "s"), "pets": (GREEN, "D"), "mpc": (GREY, "^")}
 CURRICULUM_LOOK = {"both": (BLUE, "-"), "threshold": (GREEN, "--"), "speed": (PINK, "-."), "none": (ORANGE, ":")}
+BUILD_LOOK = {"compiled": (BLUE, "-"), "eager": (ORANGE, "--")}
 SYSTEM_LOOK = {"quadrotor": (BLUE, "o"), "fixed_wing": (ORANGE, "s")}
 NOTHING = {"low": np.nan, "mean": np.nan, "high": np.nan}
 MOST = 0.9  # share of flights

@@ -1,4 +1,4 @@
-"""Figures of the results: horizon, curriculum, fine-tuning, error over transitions, error over training.
+"""Figures of the results: horizon, curriculum, fine-tuning, error over transitions and training, compiled and eager.
 
 Lines are means over seeds, bands reach from the least to the greatest seed: on a logarithmic axis a mean less a
 standard deviation may have no place. Open markers are the paper's values. Each PNG carries a digest of the rows that it
@@ -19,6 +19,7 @@ from matplotlib.ticker import FixedLocator, NullLocator
 from adapt.evidence import Evidence
 from adapt.experiment_table import HORIZONS
 from adapt.figure_parts import (
+    BUILD_LOOK,
     CURRICULUM_LOOK,
     FAILING_LOOK,
     METHOD_LOOK,
@@ -270,6 +271,21 @@ def draw_learning(evidence):
     return figure
 
 
+def draw_speed(evidence):
+    """Validation error over wall-clock time with compiled and with eager dynamics; the updates are the same."""
+    figure, axes = panels(2, (10, 4.2))
+    for one, system in zip(axes, SYSTEM_LOOK, strict=True):
+        for build, (colour, style) in BUILD_LOOK.items():
+            curve(one, evidence.curves, f"speed-{build}-{system}", "seconds", colour, linestyle=style, label=build)
+        one.set_title(TITLES[system])
+        logarithmic(one.xaxis, plain=False)
+        logarithmic(one.yaxis)
+        one.set_xlabel("training time, validation included [s]")
+    axes[0].set_ylabel("error of successful flights [m]")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure
+
+
 AIRCRAFT = "(quadrotor|fixed_wing)"
 PICTURES = {
     "horizon": Picture(draw_horizon, rows=r"horizon-.*", table="table2"),
@@ -279,4 +295,5 @@ PICTURES = {
     ),
     "samples": Picture(draw_samples, rows=rf"drag-.*-{AIRCRAFT}-(zero|target|\d+)", table="table4"),
     "learning": Picture(draw_learning, curves=rf"(apg|ppo)-{AIRCRAFT}"),
+    "speed": Picture(draw_speed, curves=rf"speed-(compiled|eager)-{AIRCRAFT}"),
 }

@@ -54,7 +54,9 @@ FULL = known(
     + points("curriculum-none", (math.nan, math.nan))
     + points("drag-apg-quadrotor-1000", (0.05, 0.02))
     + points("apg-quadrotor", (1.0, 0.1))
-    + points("ppo-quadrotor", (3.0, 0.3)),
+    + points("ppo-quadrotor", (3.0, 0.3))
+    + points("speed-compiled-quadrotor", (2.0, 0.2))
+    + points("speed-eager-fixed_wing", (4.0, 0.4)),
 )
 
 
@@ -167,6 +169,12 @@ def test_training_is_shown_over_steps_and_over_time():
     steps, seconds = drawn("learning")[:2]
     assert [line for line in lines(steps) if line] == [{1000: 1.0, 2000: 0.1}, {1000: 3.0, 2000: 0.3}]
     assert [line for line in lines(seconds) if line] == [{1: 1.0, 2: 0.1}, {1: 3.0, 2: 0.3}]
+
+
+def test_each_build_of_the_dynamics_is_shown_over_the_time_that_it_took():
+    quadrotor, fixed_wing = drawn("speed")
+    assert [line for line in lines(quadrotor) if line] == [{1: 2.0, 2: 0.2}]
+    assert [line for line in lines(fixed_wing) if line] == [{1: 4.0, 2: 0.4}]
 
 
 def test_errors_of_few_successful_flights_are_marked_in_training():
