@@ -17,6 +17,7 @@ from envs.errors import InputError
 from policies.files import whole
 
 USAGE, INTERRUPTED, READER_GONE = 2, 130, 141  # exit statuses
+DEFAULT_SYSTEM = "quadrotor"
 FULL_OR_FORBIDDEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EROFS, errno.EPERM)
 
 
@@ -122,6 +123,21 @@ def _finite(content):
     return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
+def with_robot(options):
+    """The options with `system` as the vehicle is one, or the quadrotor, where `--system` leaves it open.
+
+    Raises:
+        InputError: a vehicle that is unknown or can't be read.
+    """
+    if options.system is not None:
+        return options
+    if options.vehicle is None:
+        return replace(options, system=DEFAULT_SYSTEM)
+    from envs.vehicles import load_vehicle
+
+    return replace(options, system=load_vehicle(options.vehicle).system.name)
+
+
 def pick_robot(name, vehicle):
     """The system that `--system` and `--vehicle` name, and the vehicle or None.
 
@@ -137,7 +153,9 @@ def pick_robot(name, vehicle):
 
     own = load_vehicle(vehicle)
     if own.system.name != system.name:
-        raise InputError(f"--vehicle {vehicle}: is a {own.system.name}, --system says {system.name}")
+        raise InputError(
+            f"--vehicle {vehicle}: is a {own.system.name}, --system says {system.name}; leave --system out"
+        )
     return own.system, own
 
 

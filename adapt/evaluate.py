@@ -14,17 +14,18 @@ from policies import pick_method
 class Options:
     """Evaluate a controller in closed loop over test episodes: metric, success, time per action and failures."""
 
-    system: str = "quadrotor"
-    """Robot: cartpole, quadrotor or fixed_wing."""
+    system: str | None = None
+    """Robot: cartpole, quadrotor or fixed_wing (default: what --vehicle is, else quadrotor)."""
     method: str = "apg"
     """apg, ppo or pets (trained; from pictures: apg-pixels, ppo-pixels), or a planner: mpc in the nominal model,
     mpc-residual in that completed by a residual learned in the target, mpc-target in the true target."""
     policy: str | None = None
     """Checkpoint of a trained method (default: the one that ships for the robot)."""
     target: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """What is different, such as drag=0.3 or mass=x1.2; may be repeated (default: nothing, the source)."""
+    """What is different, such as drag=0.3 or mass=x1.2, or noise=1 for sensors that err: 1 mm, 0.02 m/s, 0.5 deg, 0.05
+    rad/s, times 1; may be repeated (default: nothing, the source)."""
     vehicle: str | None = None
-    """Parameters of your own robot: a shipped name such as crazyflie, or a TOML file."""
+    """Parameters of your own robot: a shipped name, crazyflie (a quadrotor) or j3cub (a fixed wing), or a TOML file."""
     set: str | None = None
     """Family of episodes (quadrotor: paper, fast, circle, lemniscate, line, hover, or a CSV of waypoints)."""
     split: str = "test"
@@ -64,6 +65,7 @@ def main(options):
     from envs.registry import make_dynamics
     from policies.evaluate import action_time, evaluate, test_episodes
 
+    options = command.with_robot(options)
     out = check(options)
     command.set_threads(options.threads)
     device = command.pick_device(options.device)

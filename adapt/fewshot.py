@@ -37,8 +37,8 @@ class Options:
 
     samples: int = 1000
     """Transitions to fly in the target."""
-    system: str = "quadrotor"
-    """Robot: cartpole, quadrotor or fixed_wing."""
+    system: str | None = None
+    """Robot: cartpole, quadrotor or fixed_wing (default: what --vehicle or --plant is, else quadrotor)."""
     target: Repeatable = ()
     """What is different in the target, such as drag=0.3 or mass=x1.2, or noise=1 for sensors that err: 1 mm, 0.02 m/s,
     0.5 deg, 0.05 rad/s, times 1; may be repeated (default: drag=0.3)."""
@@ -78,9 +78,9 @@ class Options:
     transitions: str | None = None
     """Learn from recorded transitions (CSV or safetensors, as this command writes them) instead of flying."""
     vehicle: str | None = None
-    """Parameters of your own robot: a shipped name such as crazyflie, or a TOML file."""
+    """Parameters of your own robot: a shipped name, crazyflie (a quadrotor) or j3cub (a fixed wing), or a TOML file."""
     log: Repeatable = ()
-    """Learn from a flight log (CSV, PX4 .ulg, ROS bag); may be repeated."""
+    """Learn from a flight log of a quadrotor (CSV, PX4 .ulg, ROS bag); may be repeated."""
     validate: Repeatable = ()
     """Flight logs to report the prediction error on; may be repeated."""
     mapping: str = "auto"

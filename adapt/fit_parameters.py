@@ -74,9 +74,11 @@ def search(base, data, named=()):
         return found
     try:
         slow = Shooting(base, data)
-    except ValueError:  # too short to tell
+        if not named:
+            return _chosen(slow)
+    except ValueError:  # too short to tell, or no flight
         return found
-    return _named(slow, named) if named else _chosen(slow)
+    return _named(slow, named)
 
 
 def _chosen(loss):

@@ -65,8 +65,8 @@ class Verdict:
     distance: float | None = None  # [-] root mean square change of the actions, which span -1 to 1
 
 
-# Where fine-tuning has led nowhere there is nothing to fly.
-UNCHANGED = Verdict(False, "fine-tuning found nothing that flies better in the fitted model", 0.0, 0.0, {}, distance=0.0)
+NOTHING_FOUND = "fine-tuning found nothing that flies better in the fitted model"
+UNCHANGED = Verdict(False, NOTHING_FOUND, 0.0, 0.0, {}, distance=0.0)
 
 
 class Gate:

@@ -28,6 +28,7 @@ from adapt.log_rows import convert
 from adapt.log_topics import read_log
 from adapt.transitions import Transitions
 from envs.errors import InputError
+from envs.quadrotor import Quadrotor
 from envs.vehicles import Vehicle
 
 
@@ -83,10 +84,13 @@ def read_flight(path, vehicle, mapping="auto"):
         mapping: name or TOML file of the column mapping, see `adapt.mappings`; "auto" goes by the columns.
 
     Raises:
-        InputError: naming the file, when it cannot be read, its reader isn't installed, it lacks topics, fields or
-            columns, is logged too slowly, or leaves nothing.
+        InputError: naming the file, when the vehicle is no quadrotor, it cannot be read, its reader isn't installed,
+            it lacks topics, fields or columns, is logged too slowly, or leaves nothing.
     """
     log = Path(path).name
+    if not isinstance(vehicle.system, Quadrotor):  # what is logged becomes collective thrust and body-rate commands
+        kind = vehicle.system.name
+        raise InputError(f"{log}: flight logs are of quadrotors, {vehicle.name} is a {kind}; give --transitions of it")
     table, mapping, missed, damaged = read_log(path, mapping, vehicle.system.dt)
     rows = convert(table, mapping, vehicle, log)._replace(missed=missed)
     step_limit = check_period(rows.time, vehicle.system.dt, log)

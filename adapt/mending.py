@@ -10,9 +10,11 @@ import torch
 
 from adapt.choose_residual import MOTION, HeldOut
 from adapt.residual import fit_residual
+from adapt.transitions import joined
 from envs.errors import InputError
 
-SHORTEST = 60  # transitions that are left to learn from, at least
+SHORTEST = 30  # transitions that are left to learn from, at least
+SMALLEST = 16  # the newest flight that is asked is no smaller a part than one of so many
 CONTRADICTS = 2.0  # times the error that newer flight leaves of itself, beyond which older flight is another robot's
 
 
@@ -60,34 +62,34 @@ def _in_time(transitions):
 def still_true(transitions, base, kind, seed=0):
     """The newest transitions that one residual of a kind explains; all, unless older flight contradicts newer.
 
-    The newer half is predicted by a residual fitted to the older one, and by residuals fitted to the rest of itself.
-    Where the first is far worse, the older half is left out, and what is left is asked again.
+    The newest half, quarter, … is predicted, a part at a time, by residuals fitted to all other flight and to the other
+    part alone. Where the first are far worse, what is older is left out, and what is left is asked again.
     """
-    while len(transitions) >= 2 * SHORTEST:
-        half = len(transitions) // 2
-        older, newer = transitions.select(slice(0, half)), transitions.select(slice(half, None))
+    tail = len(transitions) // 2
+    while tail >= max(SHORTEST, len(transitions) // SMALLEST):
+        split = len(transitions) - tail
+        older, newer = transitions.select(slice(0, split)), transitions.select(slice(split, None))
         try:
-            if not _contradict(older, newer, base, kind, seed):
-                break
+            if _contradict(older, newer, base, kind, seed):
+                transitions = newer
         except (InputError, ValueError):  # too short to tell
             break
-        transitions = newer
+        tail //= 2
     return transitions
 
 
 def _contradict(older, newer, base, kind, seed):
     cut = len(newer) // 2
     parts = [newer.select(slice(0, cut)), newer.select(slice(cut, None))]
-    before = fit_residual(older, base, kind, seed)[0]
     errors = []
     for learned, held in (parts, parts[::-1]):
         flown = HeldOut(base, _double(held))
-        own = fit_residual(learned, base, kind, seed)[0]
-        found = [flown.missed(residual).square().mean((0, 1)) for residual in (before, own)]
+        fits = [fit_residual(data, base, kind, seed)[0] for data in (joined((older, learned)), learned)]
+        found = [flown.missed(residual).square().mean((0, 1)) for residual in fits]
         errors.append(torch.stack([*found, flown.moved.mean(0)]))
-    by_older, by_newer, moved = torch.stack(errors).mean(0)
+    by_all, by_newer, moved = torch.stack(errors).mean(0)
     units = torch.maximum(by_newer, MOTION**2 * moved).clamp(min=1e-18)
-    return float((by_older / units).mean().sqrt()) > CONTRADICTS
+    return float((by_all / units).mean().sqrt()) > CONTRADICTS
 
 
 def _double(data):

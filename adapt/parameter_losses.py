@@ -87,7 +87,11 @@ class Shooting:
 
     @torch.no_grad()
     def linearised(self, values, names):
-        """See `OneStep`; the initial states are estimated anew for the given values."""
+        """See `OneStep`; the initial states are estimated anew for the given values.
+
+        Raises:
+            InputError: states or values from which no flight can be predicted.
+        """
         dynamics, system = changed(self.base, values), self.base.system
         path = self.flown.predicted(dynamics, self.start)
         slopes = step_slopes(dynamics, path[:, :-1], self.flown.action)
@@ -96,6 +100,8 @@ class Shooting:
             left = self.flown.missed(system, path)
             if self._estimate_noise(left):
                 break
+            if not left.isfinite().all() or not inner.isfinite().all():  # LAPACK fails on them
+                raise InputError("transitions: no flight can be predicted from such states; remove what isn't flight")
             change = torch.linalg.lstsq(self._scaled(inner), self._scaled(left[..., None])).solution
             self.start = displaced(system, self.start, change.squeeze(-1))
             path = self.flown.predicted(dynamics, self.start)

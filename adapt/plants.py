@@ -7,6 +7,7 @@ exception in mid-flight, an array of another shape.
 
 import math
 from importlib import import_module
+from numbers import Real
 from typing import Protocol
 
 import numpy as np
@@ -18,6 +19,7 @@ from envs.errors import InputError
 from policies import METHODS
 
 PATIENCE = 3  # flights in a row that may end before their first step; then a plant is given up
+LARGEST = 1e9  # [SI unit of the state] what no state of a robot exceeds
 FAULTS = 5  # that a report tells in words
 
 
@@ -59,6 +61,8 @@ class Flights:
         if missing := [method for method in ("reset", "step") if not callable(getattr(plant, method, None))]:
             raise InputError(f"{name}: {type(plant).__name__} has no method {missing[0]}; a plant has reset and step")
         period = getattr(plant, "dt", system.dt)
+        if not isinstance(period, Real):
+            raise InputError(f"{name}: control period is {period!r}, expected {system.dt:g}, a number of seconds")
         if not math.isclose(period, system.dt, rel_tol=DT_TOLERANCE):
             raise InputError(f"{name}: control period is {period:g} s, expected {system.dt:g} s as of {system.name}")
 
@@ -132,6 +136,8 @@ class Flights:
             return wrong
         if not np.isfinite(values).all():
             return f"{names[int(np.argmin(np.isfinite(values)))]} is not finite"
+        if np.abs(values).max() > LARGEST:
+            return f"{names[int(np.abs(values).argmax())]} is {values[np.abs(values).argmax()]:.3g}"
         if set(QUATERNION) <= set(names):
             length = float(np.linalg.norm([values[names.index(name)] for name in QUATERNION]))
             if abs(length - 1) > QUATERNION_TOLERANCE:

@@ -152,7 +152,9 @@ def draw_flight(adaptation):
     evaluations = [adaptation.evaluations[name] for name in names]
     columns = [_columns(task, evaluation, row) for evaluation in evaluations]
     errors = [traces(task, evaluation)[row] for evaluation in evaluations]
-    largest = float(np.nanquantile(np.concatenate(errors), 0.98))
+    known = np.concatenate(errors)
+    known = known[np.isfinite(known)]
+    largest = float(np.quantile(known, 0.98)) if len(known) else 0.0  # a plant that is dead flies no step
     factor, unit = small([largest], task.trace_unit)
     norm = Normalize(0, max(factor * largest, 1e-9))
     proportions = [_proportion(task.system, columns, view) for view in views]
@@ -224,7 +226,8 @@ def draw_error(adaptation):
     """Error over time: mean of all test flights, and the band that holds eight of ten."""
     task, evaluations = adaptation.policy.task, adaptation.evaluations
     found = {name: traces(task, evaluations[name]) for name in COLOURS if name in evaluations}
-    factor, unit = small([np.nanmean(trace[:, _flying(trace)], 0).max() for trace in found.values()], task.trace_unit)
+    means = [np.nanmean(trace[:, _flying(trace)], 0) for trace in found.values()]  # of a dead plant, without a step
+    factor, unit = small(np.concatenate(means), task.trace_unit)
     figure = Figure(figsize=(7, 4.4), layout="constrained")
     axes = figure.subplots()
     for name, trace in found.items():
@@ -233,8 +236,9 @@ def draw_error(adaptation):
         style = "--" if name == "source" else "-"
         said = f"{NAMES[name]}: {score(evaluations[name], score_scale(adaptation))}"
         axes.plot(time, np.nanmean(error, 0), style, color=COLOURS[name], label=said)
-        low, high = np.nanquantile(error, (0.1, 0.9), axis=0)
-        axes.fill_between(time, low, high, color=COLOURS[name], alpha=0.15, linewidth=0)
+        if flying.any():
+            low, high = np.nanquantile(error, (0.1, 0.9), axis=0)
+            axes.fill_between(time, low, high, color=COLOURS[name], alpha=0.15, linewidth=0)
     axes.set_xlabel("time [s]")
     axes.set_ylabel(f"{task.trace_name} [{unit}]")
     axes.set_ylim(bottom=0)

@@ -55,15 +55,26 @@ def gate_line(verdict):
 
 
 def parameter_table(residual):
-    """The parameters that were refitted, as a list of one table, or of nothing where there are none."""
+    """The parameters that were refitted, as a list of one table, or of nothing where there are none.
+
+    Beside each stands what the data can't tell it from, and how much of that undoes one unit more of it: the direction
+    in parameter space that the data don't determine.
+    """
     from tabulate import tabulate
 
     found = residual.get("parameters") or {}
     rows = [
-        (name, f"{one['value']:.4g} ± {one['standard_error']:.1g}", ", ".join(residual["alike"].get(name, ())))
+        (
+            *(name, f"{one['value']:.4g} ± {one['standard_error']:.1g}"),
+            ", ".join(
+                other if amount is None else f"{other} {amount:+.3g}"
+                for other, amount in residual["alike"].get(name, {}).items()
+            ),
+        )
         for name, one in found.items()
     ]
-    return [tabulate(rows, ("refitted", "value", "these data can't tell it from"), "simple")] if rows else []
+    header = ("refitted", "value", "these data can't tell it from (so much undoes +1 of it)")
+    return [tabulate(rows, header, "simple")] if rows else []
 
 
 def notes(metrics):

@@ -86,7 +86,7 @@ class FitReport:
     penalty: dict[str, float] = field(default_factory=dict)  # of the ridge, by output
     network: tuple[str, ...] = ()  # outputs where a network stays
     parameters: dict[str, tuple[float, float]] = field(default_factory=dict)  # fitted value and standard error
-    alike: dict[str, tuple[str, ...]] = field(default_factory=dict)  # parameters that data can't tell from these
+    alike: dict[str, dict] = field(default_factory=dict)  # what data can't tell from each, and how much undoes +1 of it
     tried: tuple[Tried, ...] = ()  # what "auto" chose from
     solved: bool = False  # whether the choice leaves next to nothing
     warnings: tuple[str, ...] = ()

@@ -21,12 +21,14 @@ class Setting:
 
 
 def with_plant(options):
-    """The options with the robot that a simulator is of, unless they name another one."""
-    if options.plant not in SIMULATORS:
-        return options
-    simulator = SIMULATORS[options.plant]
-    system = simulator.system if options.system == type(options).system else options.system
-    return replace(options, system=system, vehicle=options.vehicle or simulator.vehicle)
+    """The options with the robot that a simulator is of, unless they name another one, and see `with_robot`."""
+    if options.plant in SIMULATORS and options.vehicle is None:
+        simulator = SIMULATORS[options.plant]
+        own = options.system in (None, simulator.system)
+        options = replace(
+            options, system=options.system or simulator.system, vehicle=simulator.vehicle if own else None
+        )
+    return command.with_robot(options)
 
 
 def pick_setting(options):

@@ -147,9 +147,9 @@ class FixedWing(System):
         """Force [N] and torque [N m] of air and propeller in body axes, gravity excluded."""
         wind = rigid_body.to_body(attitude(x), (self.wind, self.crosswind, self.downdraught))
         ua, va, wa = x.u_b - wind[0], x.v_b - wind[1], x.w_b - wind[2]
-        plane = (ua * ua + wa * wa).sqrt()  # airspeed in the plane of symmetry
-        speed = (ua * ua + va * va + wa * wa).sqrt()
-        alpha = limited((wa / ua).arctan(), self.incidence_limit)
+        plane = (ua * ua + wa * wa + CALM).sqrt()  # airspeed in the plane of symmetry
+        speed = (ua * ua + va * va + wa * wa + CALM).sqrt()
+        alpha = limited((wa * ua / (ua * ua + CALM)).arctan(), self.incidence_limit)  # of wa / ua
         beta = limited((va / plane).arctan(), self.incidence_limit)
         half_chord, half_span = self.chord / 2 / speed, self.span / 2 / speed
         elevator, aileron, rudder = (
@@ -224,6 +224,9 @@ class FixedWing(System):
 
 
 CRUISE = 11.5  # [m/s] speed at which the task starts
+# [m^2/s^2] added to squares of airspeeds: keeps angles, forces and their gradients finite where the air stands still
+# about the aircraft, as in a tail wind as fast as it flies. In flight it changes them by less than 1e-8 of themselves.
+CALM = 1e-6
 
 
 def _weighted(coefficients, values):

@@ -36,9 +36,7 @@ def test_the_model_leaves_everything_and_the_truth_nothing(data):
     # states that a drag doesn't change, attitude and rates, count nothing and leave a half
     assert everything == pytest.approx(0.5)
     assert nothing < 1e-6
-    assert a_quarter == pytest.approx(
-        everything / 4, rel=0.2
-    )  # over a second, it grows a little slower
+    assert a_quarter == pytest.approx(everything / 4, rel=0.2)  # over a second, it grows a little slower
 
 
 def test_what_predicts_the_next_measurement_by_filtering_noise_is_no_better_than_the_truth(data):

@@ -8,7 +8,7 @@ import resource
 import signal
 import subprocess
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from pathlib import Path
 
@@ -218,6 +218,33 @@ def test_a_vehicle_is_its_system_and_must_be_of_the_named_kind():
     assert command.pick_robot("cartpole", None)[1] is None
     with pytest.raises(InputError, match="--vehicle crazyflie: is a quadrotor, --system says cartpole"):
         command.pick_robot("cartpole", "crazyflie")
+
+
+@pytest.mark.parametrize(
+    ("options", "system"),
+    [
+        ({}, "quadrotor"),
+        ({"vehicle": "crazyflie"}, "quadrotor"),
+        ({"vehicle": "j3cub"}, "fixed_wing"),
+        ({"system": "cartpole"}, "cartpole"),
+        ({"system": "quadrotor", "vehicle": "j3cub"}, "quadrotor"),  # that is refused, see `pick_robot`
+    ],
+)
+@pytest.mark.parametrize("name", ["fewshot", "pretrain", "evaluate"])
+def test_a_system_that_is_left_open_is_that_of_the_vehicle(name, options, system):
+    made = import_module(f"adapt.{name}").Options(**options)
+    assert command.with_robot(made) == replace(made, system=system)
+
+
+@pytest.mark.parametrize("name", ["fewshot", "pretrain", "evaluate", "vision"])
+def test_the_help_says_what_erring_sensors_are_and_what_robot_a_vehicle_is(call, name):
+    answer = call(name, "--help")
+    said = " ".join(answer.out.replace("│", " ").split())
+    assert answer.status == 0
+    for words in ("noise=1", "err", "1 mm", "0.02 m/s", "0.5 deg", "0.05 rad/s"):
+        assert words in said
+    if name != "vision":
+        assert "j3cub (a fixed wing)" in said
 
 
 def test_where_no_policy_ships_the_command_that_makes_one_is_named(monkeypatch):

@@ -296,6 +296,25 @@ def test_validation_flights_that_are_too_short_are_told_before_the_work(refused,
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--system", "fixed_wing"), "--log: needs --vehicle"),
+        (("--system", "fixed_wing", "--vehicle", "crazyflie"), "is a quadrotor, --system says fixed_wing; leave --sy"),
+        (("--system", "cartpole", "--vehicle", "crazyflie"), "is a quadrotor, --system says cartpole; leave --system"),
+        (
+            ("--system", "fixed_wing", "--vehicle", "j3cub"),
+            "a.csv: flight logs are of quadrotors, j3cub is a fixed_wing",
+        ),
+        (("--vehicle", "j3cub"), "a.csv: flight logs are of quadrotors, j3cub is a fixed_wing"),
+    ],
+)
+def test_a_log_of_another_robot_is_told_in_one_line(refused, tmp_path, options, words):
+    log = hover_log(tmp_path / "a.csv", 3)
+    assert words in refused("fewshot", "--log", log, *options, "--out", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_the_table_says_where_was_flown_if_not_in_the_target(finished):
     metrics = read(finished[0])
     assert "flown in" not in report.table(metrics)

@@ -419,6 +419,11 @@ def test_an_unknown_mapping_and_a_vehicle_without_motors_are_errors(tmp_path):
         read_flight(written(tmp_path, hovering()), replace(VEHICLE, motors=None))
 
 
+def test_a_log_is_not_read_as_flight_of_an_aircraft_without_rotors(tmp_path):
+    with pytest.raises(InputError, match=r"flight\.csv: flight logs are of quadrotors, j3cub is a fixed_wing"):
+        read_flight(written(tmp_path, hovering()), load_vehicle("j3cub"))
+
+
 # ------------------------------------------------------------------------------------------------- several flights
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from adapt import collect
+from adapt import collect, report
 from adapt.fit_parameters import search, undetermined
 from adapt.parameter_losses import OneStep, Shooting
 from adapt.parameter_residual import changed, own_parameters
@@ -127,6 +127,96 @@ def test_parameters_that_act_alike_are_told():
     found = search(Dynamics(make_system("quadrotor")), flown("quadrotor", "thrust_loss=0.15", 60))
     (name,) = found.values
     assert {name, *found.alike[name]} >= {"mass", "thrust_loss"}
+
+
+def fallen_short(noise=None):
+    """Hover (float64) of a quadrotor whose motors give nine tenths of the commanded thrust, as five flights."""
+    system = make_system("quadrotor")
+    half = (system.thrust_max - system.thrust_min) / 2
+    data = hovering(100)
+    action = data.action.clone()
+    action[:, 0] = (system.gravity / 0.9 - system.thrust_min) / half - 1
+    data = replace(data, action=action, trajectory=torch.arange(100) // 20)
+    return data if noise is None else measured(data, noise)
+
+
+@pytest.mark.parametrize("noise", [None, 0])
+@pytest.mark.parametrize("kind", ["parameters", "auto"])
+def test_hover_alone_says_what_thrust_cannot_be_told_from_and_in_which_direction(kind, noise):
+    """In hover thrust / mass = gravity: d mass / mass = - d gravity / gravity, and thrust lost acts as mass gained."""
+    _, fit = fit_residual(fallen_short(noise), Dynamics(make_system("quadrotor")), kind)
+    assert fit.kind == "parameters"
+    assert fit.parameters["mass"][0] == pytest.approx(0.723 / 0.9, rel=1e-3)
+    undoing = fit.alike["mass"]
+    assert undoing["gravity"] == pytest.approx(-9.81 * 0.9 / 0.723, rel=2e-3)
+    assert undoing["push_z"] == pytest.approx(9.81 * 0.9 / 0.723, rel=2e-3)
+    assert undoing["thrust_loss"] == pytest.approx(-0.9 / 0.723, rel=2e-3)
+    (table,) = report.parameter_table({"parameters": {"mass": {"value": 0.8, "standard_error": 0}}, "alike": fit.alike})
+    assert "so much undoes +1 of it" in table
+    assert "gravity -12.2" in table
+
+
+def test_the_direction_that_is_told_changes_no_prediction():
+    base, data = Dynamics(make_system("quadrotor")), fallen_short()
+    _, fit = fit_residual(data, base, "parameters")
+    mass, little = fit.parameters["mass"][0], 1e-5
+
+    def moved(**values):
+        dynamics = changed(base, {"mass": mass, **values})
+        return float(
+            (dynamics(data.state, data.action) - changed(base, {"mass": mass})(data.state, data.action)).abs().max()
+        )
+
+    alone = moved(mass=mass + little)
+    told = {name: amount for name, amount in fit.alike["mass"].items() if amount is not None}
+    assert {"gravity", "thrust_loss"} <= told.keys()
+    for name, amount in told.items():
+        there = own_parameters(base.system).get(name, 0.0) + little * amount
+        assert moved(mass=mass + little, **{name: there}) < 1e-3 * alone
+
+
+def test_the_direction_is_that_beside_the_other_fitted_parameters():
+    """A drag that is fitted too doesn't hide that mass and thrust can't be told apart."""
+    _, fit = fit_residual(
+        flown("quadrotor", "drag=0.3 thrust_loss=0.15", 100), Dynamics(make_system("quadrotor")), "parameters"
+    )
+    assert fit.parameters.keys() == {"mass", "drag"}
+    assert fit.alike["mass"]["thrust_loss"] == pytest.approx(-1 / fit.parameters["mass"][0], rel=1e-3)
+
+
+@pytest.mark.parametrize("value", [1e30, 1e160])
+def test_states_that_are_no_flight_crash_nothing(value):
+    """What a glitch of a sensor leaves in a file is finite, but no step can be predicted from it."""
+    data = flown("cartpole", "drag=1", 60)
+    following, state = data.next_state.clone(), data.state.clone()
+    following[20], state[21] = value, value
+    try:
+        residual, _ = fit_residual(replace(data, next_state=following, state=state), Dynamics(make_system("cartpole")))
+    except InputError as error:
+        assert str(error).startswith("transitions: ")
+    else:
+        assert residual(data.state[:5], data.action[:5]).isfinite().all()
+
+
+def test_stretches_that_nothing_can_be_predicted_from_are_refused():
+    data = flown("cartpole", "drag=1", 60)
+    state, following = data.state.clone(), data.next_state.clone()
+    following[20] = state[21] = torch.inf
+    loss = Shooting(Dynamics(make_system("cartpole")), replace(data, state=state, next_state=following))
+    with pytest.raises(InputError, match="no flight can be predicted from such states"):
+        loss.linearised({}, ("gravity",))
+
+
+def test_where_all_data_together_run_away_what_was_found_without_some_stays(monkeypatch):
+    """Held-out flight may contradict the rest, so that no values explain both."""
+    from adapt import fit_parameters
+
+    data, whole = flown("quadrotor", "drag=0.3", 60), fit_parameters.settle
+    monkeypatch.setattr(
+        fit_parameters, "settle", lambda loss, *rest: None if len(loss.data) == len(data) else whole(loss, *rest)
+    )
+    _, fit = fit_residual(data, Dynamics(make_system("quadrotor")), "parameters")
+    assert fit.parameters["drag"][0] == pytest.approx(0.3, rel=1e-4)
 
 
 def test_named_parameters_are_all_fitted():

@@ -126,6 +126,7 @@ def raised(error):
 FAULTS = {
     "nan": (lambda: [0.0, np.nan, 0.0, 0.0], "v is not finite"),
     "death": (lambda: raised(ConnectionError("link\nlost")), "ConnectionError: link lost"),
+    "beyond all bounds": (lambda: [0.0, 1e30, 0.0, 0.0], "v is 1e\\+30"),
     "shape": (lambda: [0.0, 0.0], r"state is list of shape \(2,\), expected \(4,\) for x, v, theta, omega"),
     "nothing": (lambda: "no fix", "state is str, expected"),
 }
@@ -176,6 +177,47 @@ def test_rounds_end_with_a_plant_that_dies_between_them(policy, target):
     dead = as_plant(policy, target, breaks=lambda flight, step: raised(OSError("gone")) if flight > 2 else None)
     result = adapt(policy, plant=dead, samples=120, rounds=2, episodes=4, config=QUICK)
     assert len(result.transitions) == 60
+
+
+@pytest.mark.parametrize("more", [{"rounds": 3}, {"until_known": True}], ids=str)
+def test_what_was_flown_before_a_refit_outlives_the_death_of_the_plant_and_the_fit(policy, target, more, monkeypatch):
+    kept, plant = [], as_plant(policy, target)
+
+    def failing(transitions, *rest, **options):
+        raise InputError("no fit")
+
+    monkeypatch.setattr("adapt.residual.fit_residual", failing)
+    with pytest.raises(InputError, match="no fit"):
+        adapt(policy, plant=plant, samples=90, config=QUICK, keep=lambda *result: kept.append(result), **more)
+    ((name, transitions),) = kept
+    assert (name, len(transitions)) == ("transitions", 30 if "rounds" in more else 10)
+
+
+@pytest.mark.parametrize("more", [{}, {"rounds": 3}, {"until_known": True}], ids=str)
+def test_too_few_transitions_of_a_plant_that_dies_are_kept_and_the_reason_is_told(policy, target, more):
+    def dies(flight, step):
+        return raised(OSError("gone")) if flight > 1 or step == 5 else None
+
+    kept = []
+    with pytest.raises(
+        InputError,
+        match=r"plant: was given up after 4 transitions \(flight 1, step 5: OSError: gone\); at least 10 are",
+    ):
+        plant = as_plant(policy, target, breaks=dies)
+        adapt(policy, plant=plant, samples=90, config=QUICK, keep=lambda *result: kept.append(result), **more)
+    assert [(name, len(transitions)) for name, transitions in kept] == [("transitions", 4)]
+
+
+@pytest.mark.parametrize("more", [{"rounds": 3}, {"until_known": True}], ids=str)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_rounds_survive_a_flight_that_breaks(policy, target, fault, more):
+    answer, words = FAULTS[fault]
+    plant = as_plant(policy, target, breaks=lambda flight, step: answer() if (flight, step) == (2, 4) else None)
+    result = adapt(policy, plant=plant, samples=60, episodes=2, config=QUICK, **more)
+    assert len(result.transitions) >= 20
+    assert result.transitions.next_state.isfinite().all()
+    assert (result.flights["broken"], result.flights["given up"]) == (1, False)
+    assert re.search(words, result.flights["faults"][0])
 
 
 def test_a_plant_that_never_flies_is_refused_with_the_reason(policy, target):
@@ -232,6 +274,9 @@ def test_another_control_period_and_a_missing_method_are_refused(policy, target)
     plant.dt = 0.02
     with pytest.raises(InputError, match=r"control period is 0\.02 s, expected 0\.05 s as of cartpole"):
         adapt(policy, plant=plant, config=QUICK)
+    plant.dt = "fast"
+    with pytest.raises(InputError, match=r"plant: control period is 'fast', expected 0\.05, a number of seconds"):
+        adapt(policy, plant=plant, config=QUICK)
     with pytest.raises(InputError, match="object has no method reset; a plant has reset and step"):
         adapt(policy, plant=object(), config=QUICK)
 
@@ -272,6 +317,12 @@ def bridge(tmp_path, monkeypatch):
         "    def step(self, state, action):\n"
         "        self.now = self.dynamics(self.now, torch.tensor(action)); return self.now.numpy()\n"
         "def cut(system): raise OSError('no cable')\n"
+        "class Dying(Bridge):\n"
+        "    left = 45\n"
+        "    def step(self, state, action):\n"
+        "        self.left -= 1\n"
+        "        if self.left < 0: raise OSError('link lost')\n"
+        "        return super().step(state, action)\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
 
@@ -288,6 +339,21 @@ def test_the_command_flies_a_plant_of_ones_own(bridge, call, cartpole_file, tmp_
     assert {"flight.png", "transitions.csv", "policy.safetensors"} <= {path.name for path in out.iterdir()}
 
 
+@pytest.mark.parametrize("more", [(), ("--rounds", 3), ("--collect",)], ids=str)
+def test_the_command_ends_well_and_draws_what_there_is_where_a_plant_dies(bridge, call, cartpole_file, tmp_path, more):
+    out = tmp_path / "run"
+    small = ("--system", "cartpole", "--policy", cartpole_file, "--samples", 60, "--updates", 2, "--episodes", 2)
+    answer = call("fewshot", "--plant", "my_bridge:Dying", *small, *more, "--out", out)
+    assert answer.status == 0, answer
+    assert answer.errors == []
+    assert "flights of the plant broke off (flight" in answer.out
+    assert "OSError: link lost); then it was given up" in answer.out
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["plant"]["given up"]
+    assert 10 <= metrics["samples"] <= 45
+    assert {"flight.png", "error.png", "transitions.csv", "policy.safetensors"} <= {path.name for path in out.iterdir()}
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -299,6 +365,7 @@ def test_the_command_flies_a_plant_of_ones_own(bridge, call, cartpole_file, tmp_
         (("--plant", "my_bridge:Other"), "can't be imported (module 'my_bridge' has no attribute 'Other')"),
         (("--plant", "my_bridge:cut"), "--plant my_bridge:cut: cut failed (OSError: no cable)"),
         (("--plant", "rotorpy", "--system", "cartpole"), "--plant rotorpy: is a quadrotor, the robot is a cartpole"),
+        (("--plant", "jsbsim", "--system", "cartpole"), "--plant jsbsim: is a fixed_wing, the robot is a cartpole"),
         (("--plant", "my_bridge:Bridge", "--oracle"), "--plant: is the target, without equations"),
         (("--plant", "my_bridge:Bridge", "--episodes", 0), "--episodes 0: expected at least 1"),
     ],

@@ -58,6 +58,15 @@ def quadrotor():
     return untrained_adaptation("quadrotor")
 
 
+def test_flights_of_a_plant_that_is_dead_are_drawn_as_none(adaptation, tmp_path):
+    dead = {}
+    for name, one in adaptation.evaluations.items():
+        states = one.states if name == "source" else torch.full_like(one.states, torch.nan)
+        dead[name] = replace(one, states=states, table=one.table.assign(success=name == "source"))
+    paths = plots.draw_all(replace(adaptation, evaluations=dead), tmp_path)
+    assert {path.name for path in paths} >= {"flight.png", "error.png"}
+
+
 def flown(name, steps):
     """Task and evaluation of an untrained network in short episodes."""
     task = make_task(name, steps=steps)

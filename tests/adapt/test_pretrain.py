@@ -14,6 +14,7 @@ import torch
 
 from adapt import pretrain, training
 from envs import make_dynamics, make_system
+from envs.vehicles import load_vehicle
 from policies import apg, compiled_dynamics, evaluate
 from policies.checkpoints import load_policy
 from policies.generated_code import CompilerError
@@ -283,6 +284,23 @@ def test_the_paper_preset_runs(call, tmp_path):
 def test_bad_options_are_refused_before_anything_is_written(refused, tmp_path, options, words):
     assert words in refused("pretrain", *TINY, "--out", tmp_path / "run", *options)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_vehicle_needs_no_system_beside_it(call, tmp_path):
+    small = ("--updates", 1, "--batch", 2, "--width", 8, "--out", tmp_path / "run")
+    assert call("pretrain", "--vehicle", "j3cub", *small).status == 0
+    policy = load_policy(tmp_path / "run" / "policy.safetensors")
+    assert policy.task.system == load_vehicle("j3cub").system
+    assert "--system fixed_wing" in policy.info["command"]
+
+
+def test_training_on_exact_states_is_said_where_sensors_err(call, tmp_path):
+    said = "trains on exact states: sensors err in the validation flights alone"
+    noisy, exact = (call("pretrain", *TINY, "--target", f"noise={n}", "--out", tmp_path / str(n)) for n in (1, 0))
+    assert said in noisy.out
+    assert said not in exact.out
+    weights = [torch.load(tmp_path / n / "training.pt", weights_only=True)["network"] for n in ("1", "0")]
+    assert_same(*weights)
 
 
 def test_a_used_folder_is_left_alone_unless_overwriting_is_asked_for(call, refused, tmp_path, contents):

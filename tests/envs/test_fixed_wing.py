@@ -10,6 +10,7 @@ from torch.autograd.functional import jacobian, jvp
 from envs import Dynamics, make_dynamics, rigid_body
 from envs.errors import InputError
 from envs.fixed_wing import CRUISE, FixedWing, limited
+from policies.compiled_dynamics import CompiledDynamics
 
 # In a mirror y, roll, yaw, v_b, p and r change sign, and so do aileron and rudder.
 MIRROR = torch.tensor([1.0, -1, 1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1], dtype=torch.float64)
@@ -140,6 +141,43 @@ def test_in_a_vacuum_it_is_a_free_rigid_body(fixed_wing, draw):
         state = Dynamics(system, substeps=20)(state, action)
     torch.testing.assert_close(energy(system, state), energy_before, atol=1e-5, rtol=1e-7)
     torch.testing.assert_close(momentum(state), momentum_before, atol=1e-6, rtol=1e-6)
+
+
+def standing_air(system):
+    """A fixed wing that flies level with a tail wind as fast as itself, which turns: state, action (3, ...)."""
+    state = level(torch.zeros(3, dtype=torch.float64)).T.contiguous()
+    state[:, 10:] = torch.tensor([[0.0, 0.0, 0.0], [0.3, -0.2, 0.1], [0.0, 1.0, 0.0]])
+    return replace(system, wind=CRUISE), state, torch.zeros(3, 4, dtype=torch.float64)
+
+
+def test_air_that_stands_still_about_the_aircraft_does_not_push_it(fixed_wing, scalars):
+    system, state, action = standing_air(fixed_wing)
+    action[:, 0] = -1
+    force, torque = system.wrench(*scalars(system, state, action))
+    assert max(float(part.abs().max()) for part in (*force, *torque)) < 1e-4
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_the_derivatives_are_finite_where_the_air_stands_still(fixed_wing, compiled):
+    system, state, action = standing_air(fixed_wing)
+    exact = Dynamics(system)
+    dynamics = CompiledDynamics(exact) if compiled else exact
+    state.requires_grad_()
+    action.requires_grad_()
+    following = dynamics(state, action)
+    slopes = torch.autograd.grad(following.square().sum(), (state, action))
+    assert all(part.isfinite().all() for part in (following, *slopes))
+    torch.testing.assert_close(following, exact(state, action), rtol=1e-9, atol=1e-11)
+    wanted = torch.autograd.grad(exact(state, action).square().sum(), (state, action))
+    torch.testing.assert_close(slopes, wanted, rtol=1e-7, atol=1e-9)
+
+
+def test_what_keeps_standing_air_finite_changes_no_flight(fixed_wing, draw, scalars, monkeypatch):
+    state, action = draw(fixed_wing, 100)
+    flown = torch.stack(sum(fixed_wing.wrench(*scalars(fixed_wing, state, action)), ()))
+    monkeypatch.setattr("envs.fixed_wing.CALM", 0.0)
+    exact = torch.stack(sum(fixed_wing.wrench(*scalars(fixed_wing, state, action)), ()))
+    assert ((flown - exact).abs() / exact.abs().amax(0)).max() < 1e-7
 
 
 def test_thrust_acts_along_a_line_below_the_body_x_axis(fixed_wing, draw, scalars):
