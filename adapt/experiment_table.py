@@ -18,15 +18,18 @@ LONGEST = HORIZONS[-1]  # whose test paths all horizons fly
 # Transitions in the target: the paper's budgets, and few.
 BUDGETS = {"quadrotor": (30, 100, 300, 1000), "fixed_wing": (30, 100, 300, 1000, 2000, 5000)}
 PPO_BUDGETS = {"quadrotor": (30, 100, 300, 1000, 5000), "fixed_wing": (30, 100, 300, 1000, 2000, 5000)}
-# Other targets than the paper's drag: what changes, and how it is called.
+# Other targets than the paper's drag. Those of the fixed wing are as strong as its thrust can make good: in a wind of
+# 3 m/s or a quadratic drag of 0.1 per metre no controller follows its reference, not even MPC in the true equations.
+ALL = ("push=0.3", "wind=2", "mass=x1.2", "thrust_loss=0.1", "quadratic_drag=0.05", "drag=0.2")
+ALL_SLIGHTLY = ("push=0.3", "wind=1", "mass=x1.2", "thrust_loss=0.1", "quadratic_drag=0.01", "drag=0.1")
 CHANGES = {
-    "drag": ("drag=0.3",),
-    "push": ("push=0.5",),
-    "wind": ("wind=3",),
-    "mass": ("mass=x1.3",),
-    "thrust": ("thrust_loss=0.15",),
-    "quadratic": ("quadratic_drag=0.1",),
-    "all": ("push=0.3", "wind=2", "mass=x1.2", "thrust_loss=0.1", "quadratic_drag=0.05", "drag=0.2"),
+    "drag": {"quadrotor": DRAG, "fixed_wing": DRAG},
+    "push": {"quadrotor": ("push=0.5",), "fixed_wing": ("push=0.5",)},
+    "wind": {"quadrotor": ("wind=3",), "fixed_wing": ("wind=2",)},
+    "mass": {"quadrotor": ("mass=x1.3",), "fixed_wing": ("mass=x1.3",)},
+    "thrust": {"quadrotor": ("thrust_loss=0.15",), "fixed_wing": ("thrust_loss=0.15",)},
+    "quadratic": {"quadrotor": ("quadratic_drag=0.1",), "fixed_wing": ("quadratic_drag=0.02",)},
+    "all": {"quadrotor": ALL, "fixed_wing": ALL_SLIGHTLY},
 }
 FEWEST = (30, 100, 1000)  # transitions in drag beside `FEW`
 FEW, NOISY = 300, 1000  # transitions in other targets, and where sensors err
@@ -203,7 +206,8 @@ def in_other_targets():
     for system in AIRCRAFT:
         for samples in FEWEST:
             yield in_target(f"target-drag-{system}-{samples}", "targets", system, DRAG, samples)
-        for change, target in CHANGES.items():
+        for change, targets in CHANGES.items():
+            target = targets[system]
             yield in_target(f"target-{change}-{system}-{FEW}", "targets", system, target, FEW)
             noisy = (*target, "noise=1")
             yield in_target(f"target-{change}-noisy-{system}-{NOISY}", "targets", system, noisy, NOISY)
