@@ -218,7 +218,7 @@ def adapt(
     check_labels(transitions, source)
     clock.next("fit")
     residual, fit = residuals.fit_residual(transitions, source, kind, seed)
-    if not fit.solved and len(newest := still_true(transitions, source, fit.kind, seed)) < len(transitions):
+    if not fit.solved and len(newest := still_true(transitions, source, seed)) < len(transitions):
         notes.append(f"older flight contradicts newer: learned from the last {len(newest)} of {len(transitions)} alone")
         transitions = newest
         residual, fit = residuals.fit_residual(transitions, source, kind, seed)

@@ -15,6 +15,7 @@ from envs.errors import InputError
 
 SHORTEST = 30  # transitions that are left to learn from, at least
 SMALLEST = 16  # the newest flight that is asked is no smaller a part than one of so many
+QUICK = "linear"  # kind of residual that tells whether flights are of one robot
 CONTRADICTS = 2.0  # times the error that newer flight leaves of itself, beyond which older flight is another robot's
 
 
@@ -59,8 +60,8 @@ def _in_time(transitions):
     return sorted(order, key=lambda number: position[flights[number]])
 
 
-def still_true(transitions, base, kind, seed=0):
-    """The newest transitions that one residual of a kind explains; all, unless older flight contradicts newer.
+def still_true(transitions, base, seed=0):
+    """The newest transitions that one residual explains; all, unless older flight contradicts newer.
 
     The newest half, quarter, … is predicted, a part at a time, by residuals fitted to all other flight and to the other
     part alone. Where the first are far worse, what is older is left out, and what is left is asked again.
@@ -70,7 +71,7 @@ def still_true(transitions, base, kind, seed=0):
         split = len(transitions) - tail
         older, newer = transitions.select(slice(0, split)), transitions.select(slice(split, None))
         try:
-            if _contradict(older, newer, base, kind, seed):
+            if _contradict(older, newer, base, seed):
                 transitions = newer
         except (InputError, ValueError):  # too short to tell
             break
@@ -78,13 +79,14 @@ def still_true(transitions, base, kind, seed=0):
     return transitions
 
 
-def _contradict(older, newer, base, kind, seed):
+def _contradict(older, newer, base, seed):
     cut = len(newer) // 2
     parts = [newer.select(slice(0, cut)), newer.select(slice(cut, None))]
     errors = []
     for learned, held in (parts, parts[::-1]):
         flown = HeldOut(base, _double(held))
-        fits = [fit_residual(data, base, kind, seed)[0] for data in (joined((older, learned)), learned)]
+        learned = (joined((older, learned)), learned)
+        fits = [fit_residual(data, base, QUICK, seed)[0] for data in learned]
         found = [flown.missed(residual).square().mean((0, 1)) for residual in fits]
         errors.append(torch.stack([*found, flown.moved.mean(0)]))
     by_all, by_newer, moved = torch.stack(errors).mean(0)

@@ -61,18 +61,18 @@ def test_a_flight_in_a_circle_is_kept_whole():
 @pytest.mark.parametrize(("before", "left"), [("drag=0.3", 300), ("mass=x1.3", 150), ("push=1", 150)])
 def test_flight_from_before_a_change_is_left_out(noise, before, left):
     both = joined((flown(before + noise, seed=1), flown("drag=0.3" + noise, seed=2)))
-    kept = still_true(both, Dynamics(load_policy("quadrotor").task.system), "parameters")
+    kept = still_true(both, Dynamics(load_policy("quadrotor").task.system))
     assert len(kept) == left
     assert torch.equal(kept.state, both.state[-left:])
 
 
 def test_a_change_late_in_the_record_is_found():
     both = joined((flown("mass=x1.3", 250, seed=1), flown("drag=0.3", 50, seed=2)))
-    kept = still_true(both, Dynamics(load_policy("quadrotor").task.system), "parameters")
+    kept = still_true(both, Dynamics(load_policy("quadrotor").task.system))
     assert len(kept) == 37  # of the 50: the newest eighth
     assert torch.equal(kept.state, both.state[-37:])
 
 
 def test_little_flight_is_kept_whatever_it_says(data):
     few = joined((flown("mass=x1.3", 20, 1), flown("drag=0.3", 20, 2)))
-    assert still_true(few, Dynamics(load_policy("quadrotor").task.system), "linear") is few
+    assert still_true(few, Dynamics(load_policy("quadrotor").task.system)) is few
