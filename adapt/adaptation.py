@@ -19,7 +19,7 @@ from adapt.mending import mended, still_true
 from adapt.plants import flights_of
 from adapt.prediction import prediction_error
 from adapt.residual_dynamics import ResidualDynamics
-from adapt.transitions import Transitions, joined
+from adapt.transitions import Transitions, check, joined
 from adapt.trust_region import Best, same_weights
 from envs.dynamics import Dynamics
 from envs.errors import InputError
@@ -195,7 +195,7 @@ def adapt(
     clock.next("evaluate")
     evaluations = {"source": evaluate(actor, source, task, tests)}
     clock.next("collect")
-    held_out = None
+    held_out, notes = None, []
     if target is not None:
         if transitions is None:
             most = PICTURE_ROUNDS if METHODS[policy.method].pixels else 1
@@ -206,16 +206,17 @@ def adapt(
             begun, transitions, footage = _collected(
                 policy, target, seen, samples, rounds, exploration, seed, device, keep, **settings
             )
+            if until_known and len(transitions) < samples:
+                notes.append(
+                    f"stopped flying after {len(transitions)} of {samples} transitions: more would tell no more"
+                )
         held_out = _held_out(actor, target, seen, len(tests), seed, device)
-    if transitions.context is not None:
-        context = transitions.context.mean(0) if context is None else torch.as_tensor(context)
-        if held_out is not None:
-            constant = context.expand(len(held_out), -1)
-            held_out = replace(held_out, context=constant, context_names=transitions.context_names)
-    transitions, notes = mended(transitions)
     keep("transitions", transitions)
     _check_flown(target, transitions)
-    check_labels(transitions, source)
+    check(transitions, source.system, residuals.MINIMUM)
+    transitions, mends = mended(transitions)
+    keep("transitions", transitions)
+    notes += [*mends, *check_labels(transitions, source)]
     clock.next("fit")
     residual, fit = residuals.fit_residual(transitions, source, kind, seed)
     if not fit.solved and len(newest := still_true(transitions, source, seed)) < len(transitions):
@@ -223,6 +224,11 @@ def adapt(
         transitions = newest
         residual, fit = residuals.fit_residual(transitions, source, kind, seed)
     fit = replace(fit, warnings=(*notes, *fit.warnings))
+    if transitions.context is not None:
+        context = transitions.context.mean(0) if context is None else torch.as_tensor(context)
+        if held_out is not None:
+            constant = context.expand(len(held_out), -1)
+            held_out = replace(held_out, context=constant, context_names=transitions.context_names)
     keep("residual", residual)
     prediction = {"model": fit.before, "model + residual": fit.after}
     if held_out is not None:
@@ -251,7 +257,7 @@ def adapt(
     evaluations["few_shot"] = evaluations["zero_shot"]
     if chosen is not policy:
         evaluations["few_shot"] = evaluate(chosen.actor(seed), truth, seen, tests)
-    if chosen is not tuned:
+    if chosen is policy and plant is None and not same_weights(policy, tuned):  # no plant is risked for it
         evaluations["refused"] = evaluate(tuned.actor(seed), truth, seen, tests)
     best = None
     if oracle:

@@ -62,7 +62,7 @@ class Options:
     """Also fine-tune in the true target, which bounds what can be gained; otherwise the error in the model does."""
     jobs: int | None = None
     """Cases at a time, each with one thread (default: as many as this process may use cores)."""
-    out: str = "results"
+    out: str = "runs/audit"
     """Folder of audit.csv and audit.png."""
     summary: bool = False
     """Only print the table and draw the picture of what is there."""
@@ -120,9 +120,8 @@ def _audit(options, folder):
             with command.terminated_as_interrupted():
                 failed = sweep.sweep(tasks, folder, engine, options.jobs or cores, finished)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(
-                f"what is done is in {folder / TABLE}; the same command goes on from there"
-            ) from None
+            done = f"what is done is in {folder / TABLE}" if (folder / TABLE).exists() else "no case is done yet"
+            raise KeyboardInterrupt(f"{done}; the same command goes on from there") from None
     if failed:
         raise RuntimeError(next(iter(failed.values())))
 
@@ -131,7 +130,7 @@ def _done(table, options):
     """(system, index) of the cases of this seed that needn't be done.
 
     Raises:
-        InputError: they were flown on another number of test episodes, or with an oracle where others have none.
+        InputError: they were flown on another number of test episodes.
     """
     rows = table[(table.seed == str(options.seed)) & (table.crash == "")]
     for row in rows.itertuples():

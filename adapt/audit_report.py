@@ -17,7 +17,7 @@ BOTH = {"ratio": ("with the gate", BLUE, "-"), "ratio_ungated": ("without", ORAN
 
 
 def numbers(table):
-    """The table of `adapt.audit.read` with numbers where it has any; a crash counts as no change."""
+    """The table of `adapt.audit.read` with numbers where it has any."""
     text = ("system", "target", "corruption", "kind", "parameters", "unit", "reason", "refused_data", "crash", "commit")
     other = [column for column in table if column not in (*text, "accepted", "python", *_packages(table))]
     rows = table.copy()
@@ -99,8 +99,13 @@ def gap(rows, name):
 
 
 def _bound(rows):
-    """Key and name of the error that can be reached."""
-    return ("oracle", "oracle") if rows.oracle_error.notna().any() else ("source", "error in the model")
+    """Key and name of the error that can be reached: by an oracle where every case has one."""
+    adapted = rows[rows.source_error.notna()]
+    return (
+        ("oracle", "oracle")
+        if len(adapted) and (adapted.oracle_success.notna()).all()
+        else ("source", "error in the model")
+    )
 
 
 def save(rows, path):
@@ -120,7 +125,8 @@ def draw(rows):
         _draw(one, part)
         one.set_title(f"{name.replace('_', ' ')}, N = {len(part)}")
     axes[0].set_ylabel("share of cases")
-    figure.supxlabel("error of the adapted policy / of the old one [-]", fontsize=STYLE["axes.labelsize"])
+    label = ("error of the adapted policy", "/ of the old one [-]")  # in two lines under a single panel
+    figure.supxlabel(("\n" if len(names) == 1 else " ").join(label), fontsize=STYLE["axes.labelsize"])
     handles = [Line2D([], [], color=colour, linestyle=style, label=name) for name, colour, style in BOTH.values()]
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
     return figure

@@ -283,6 +283,9 @@ def environment(seed, threads):
 
     # The hash alone, even on a tag; "-dirty" where files differ from the commit.
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude", "*"]
-    commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+    try:
+        commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+    except OSError:  # no git, no commit
+        commit = ""
     packages = {name: version(name) for name in ("torch", "torchrl", "tensordict", "casadi")}
     return {"seed": seed, "threads": threads, "python": platform.python_version(), **packages, "commit": commit}

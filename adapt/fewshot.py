@@ -211,6 +211,11 @@ def _adapt(options, setting, policy, recorded, folder, device):
         )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"what was finished is in {folder}") from None
+    except InputError as error:
+        sources = ", ".join((*options.log, *filter(None, [options.transitions])))
+        if sources and str(error).startswith("transitions:"):
+            raise InputError(str(error).replace("transitions", sources, 1)) from None
+        raise
 
 
 def _updates(options, policy):
@@ -233,7 +238,7 @@ def _metrics(options, policy, adaptation, validation):
         "seed": options.seed,
         **{name: evaluation.summary for name, evaluation in adaptation.evaluations.items()},
         "prediction": adaptation.prediction,
-        "residual": _found(fit),
+        "residual": _found(fit, task.system),
         "seconds": adaptation.seconds,
         "threads": options.threads,
     }
@@ -257,10 +262,15 @@ def _metrics(options, policy, adaptation, validation):
     return metrics
 
 
-def _found(fit):
+def _found(fit, system):
     """What was learned, for people."""
+    from adapt.parameter_residual import nominal
+
     said = {"kind": fit.kind, "inputs": fit.inputs, "network": fit.network, "warnings": fit.warnings}
-    values = {name: {"value": value, "standard_error": error} for name, (value, error) in fit.parameters.items()}
+    values = {
+        name: {"value": value, "standard_error": error, "model": nominal(system, name)}
+        for name, (value, error) in fit.parameters.items()
+    }
     if fit.tried:
         said["tried"] = {one.kind: one.score if one.squares is not None else one.why for one in fit.tried}
     return said | ({"parameters": values, "alike": fit.alike} if fit.kind == "parameters" else {})

@@ -17,6 +17,9 @@ from policies.compiled_dynamics import fastest
 from policies.evaluate import evaluate, test_episodes
 
 EPISODES = 32  # validation episodes flown in each model
+APART = 1_000_000  # between the seeds of its episodes and of those that weights are chosen by
+SHARED = 0.5  # of the episodes that both policies must fly for their errors to be compared
+SAVED = 0.25  # of the episodes that only the new policy flies, which is a gain whatever the errors
 CONFIDENCE = 0.95  # that the new policy is better
 WORSE = 0.05  # [-] by which it may be worse in a single model
 
@@ -38,16 +41,22 @@ class Flown:
 
     @property
     def gain(self):
-        """log(mean error of the old / of the new policy) over the episodes that both fly; infinite without any."""
-        if not self.both.any():
-            return math.copysign(math.inf, float(self.new_succeeded.sum() - self.old_succeeded.sum()) - 0.5)
+        """log(mean error of the old / of the new policy) over the episodes that both fly.
+
+        Infinite where the new policy flies many more; nan where too few are flown by both to tell.
+        """
+        count = len(self.old)
+        if self.new_succeeded.sum() - self.old_succeeded.sum() >= SAVED * count:
+            return math.inf
+        if self.both.sum() < SHARED * count:
+            return math.nan
         return float((self.old[self.both].mean() / self.new[self.both].mean()).log())
 
     @property
     def doubt(self):
-        """Standard error of the gain, by the paired differences over the episodes."""
+        """Standard error of the gain, by the paired differences over the episodes; infinite of less than two."""
         if int(self.both.sum()) < 2:
-            return 0.0
+            return math.inf
         old, new = self.old[self.both], self.new[self.both]
         return float((old / old.mean() - new / new.mean()).std()) / len(old) ** 0.5
 
@@ -78,9 +87,10 @@ class Gate:
 
     def __init__(self, old, models, task=None, seed=0, episodes=EPISODES):
         self.old, self.task, self.seed = old, task or old.task, seed
-        self.models = {name: fastest(dynamics)[0] for name, dynamics in models.items()}
         device = next(old.network.parameters()).device
-        self.episodes = test_episodes(self.task, episodes, "validation", seed).to(device)
+        compiled = device.type == "cpu"
+        self.models = {name: fastest(dynamics)[0] if compiled else dynamics for name, dynamics in models.items()}
+        self.episodes = test_episodes(self.task, episodes, "validation", APART + seed).to(device)
         self.before = {name: self._fly(old, name) for name in models}
 
     def _fly(self, policy, name):
@@ -104,7 +114,7 @@ class Gate:
         for share in SHARES:
             tried = part_way(self.old, new, share)
             changed = distance(self.old, tried, first)
-            if changed is not None and changed > FARTHEST:
+            if changed is not None and not changed <= FARTHEST:  # nan, too
                 reason = f"the new policy's actions differ by {changed:.2f}, at most {FARTHEST:g} is allowed"
                 verdicts.append(Verdict(False, reason, 0.0, math.nan, {}, share, changed))
                 continue
@@ -119,11 +129,14 @@ def decide(flown, confidence=CONFIDENCE):
     """The `Verdict` on what was flown."""
     gains = torch.tensor([one.gain for one in flown], dtype=torch.float64)
     models = {one.model: _figures(one) for one in flown}
-    sure = _sureness(gains, flown)
+    sure = _sureness(flown)
     mean = float(gains.mean())
     if failing := [one.model for one in flown if one.new_succeeded.sum() < one.old_succeeded.sum()]:
         reason = f"the new policy fails more often in {_listed(failing)}"
         return Verdict(False, reason, sure, mean, models)
+    if untold := [one.model for one in flown if math.isnan(one.gain)]:
+        reason = f"too few flights succeed in {_listed(untold)} to tell which policy is better"
+        return Verdict(False, reason, 0.0, math.nan, models)
     if worse := [one.model for one, gain in zip(flown, gains.tolist(), strict=True) if gain < -math.log1p(WORSE)]:
         reason = f"the new policy is worse in {_listed(worse)}"
         return Verdict(False, reason, sure, mean, models)
@@ -133,12 +146,17 @@ def decide(flown, confidence=CONFIDENCE):
     return Verdict(True, f"better in {len(flown)} models, confidence {sure:.3f}", sure, mean, models)
 
 
-def _sureness(gains, flown):
-    """Probability that the mean gain is positive, if gains are normal over episodes and over models."""
-    if not gains.isfinite().all():
-        return float((gains > 0).double().mean())
+def _sureness(flown):
+    """Probability that the mean gain is positive, if gains are normal over episodes and over models.
+
+    Models in which the new policy flies many more episodes leave no doubt, and say nothing about the others.
+    """
+    compared = [one for one in flown if math.isfinite(one.gain)]
+    if not compared:
+        return float(all(one.gain > 0 for one in flown))
+    gains = torch.tensor([one.gain for one in compared], dtype=torch.float64)
     between = float(gains.std()) if len(gains) > 1 else 0.0
-    doubt = math.hypot(between, max(one.doubt for one in flown))
+    doubt = math.hypot(between, max(one.doubt for one in compared))
     return 0.5 * (1 + math.erf(float(gains.mean()) / max(doubt, 1e-12) / math.sqrt(2)))
 
 

@@ -1,8 +1,8 @@
-"""Whether recorded actions are what their columns say: not swapped, not of the other sign, not a period late or early.
+"""Whether recorded actions are what their columns say: not swapped, not of the other sign, not recorded a period late.
 
 A residual would explain such a record just as well as the true one, and be as sure of it; the policy tuned in it then
 steers the wrong way. But the model itself, which knows what each action does, predicts far better once the actions are
-put right. No change of a robot does that.
+put right. No change of a robot does that, but for one: its actuators may act a period late.
 """
 
 import math
@@ -17,6 +17,7 @@ from envs.errors import InputError
 FAR_BETTER = 0.2  # [-] by which the logarithm of what the model misses falls
 FEWEST = 5  # transitions that a shift in time is judged by
 MISSED = 1e-6  # [m/s, rad/s] over a period that is as good as nothing
+DELAYED = "with each action one control period later"
 QUANTITIES = ("velocity", "rates")  # that actions act on at once
 
 
@@ -27,6 +28,9 @@ def check_labels(transitions, base):
         transitions: in the order in which they were flown.
         base: `Dynamics` of the source.
 
+    Returns:
+        notes, as sentences: that the robot acts a period late, if it does.
+
     Raises:
         InputError: the model explains the record far better with other labels; names them.
     """
@@ -34,7 +38,10 @@ def check_labels(transitions, base):
     gain, words = max(found)
     if gain > FAR_BETTER:
         better = f"the model explains them {math.exp(gain):.1f} times as well {words}"
-        raise InputError(f"transitions: {better}; put the actions right and begin again")
+        if words != DELAYED:
+            raise InputError(f"transitions: {better}; put the actions right and begin again")
+        return [f"{better}: the robot acts late, or was recorded early, and no residual learns a delay"]
+    return []
 
 
 def _labellings(data):
@@ -52,7 +59,7 @@ def _labellings(data):
         first = follows.nonzero()[:, 0]
         late, early = data.select(first), data.select(first + 1)
         yield "with each action one control period earlier", late, replace(late, action=early.action)
-        yield "with each action one control period later", early, replace(early, action=late.action)
+        yield DELAYED, early, replace(early, action=late.action)
 
 
 @torch.no_grad()

@@ -65,7 +65,7 @@ def parameter_table(residual):
     found = residual.get("parameters") or {}
     rows = [
         (
-            *(name, f"{one['value']:.4g} ± {one['standard_error']:.1g}"),
+            *(name, f"{one['model']:.4g}", f"{one['value']:.4g} ± {one['standard_error']:.1g}"),
             ", ".join(
                 other if amount is None else f"{other} {amount:+.3g}"
                 for other, amount in residual["alike"].get(name, {}).items()
@@ -73,7 +73,7 @@ def parameter_table(residual):
         )
         for name, one in found.items()
     ]
-    header = ("refitted", "value", "these data can't tell it from (so much undoes +1 of it)")
+    header = ("refitted", "in the model", "value", "these data can't tell it from (so much undoes +1 of it)")
     return [tabulate(rows, header, "simple")] if rows else []
 
 

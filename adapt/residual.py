@@ -151,9 +151,9 @@ def _chosen(data, base, seed, settings, began):
 
     try:
         tried, kind, solved = choose(data, base, MENU, held_out_fit)
-    except ValueError:  # no flight is long enough to predict
+    except ValueError:  # no flight is long enough to predict, or too few to leave any out
         residual, report = fit(data, BLIND)
-        warning = f"flights are too short to tell which kind of residual predicts best; took {BLIND}"
+        warning = f"flights are too few or too short to tell which kind of residual predicts best; took {BLIND}"
         return residual, replace(report, warnings=(*report.warnings, warning))
     residual, report = named if kind == "parameters" else fit(data, kind)
     return residual, replace(report, tried=tried, solved=solved, seconds=time.perf_counter() - began)

@@ -1,9 +1,7 @@
 """Tables beyond the paper's: other targets, what the choice of a residual costs, third-party simulators."""
 
-import math
-
 from adapt.experiment_table import AIRCRAFT, ALL, ALL_SLIGHTLY, CHANGES, FEW, FEWEST, KINDS_TRIED, NOISY, SIMULATED
-from adapt.table_cells import NONE, SYSTEM_NAMES, Table, amount, decimals, ours, seeds
+from adapt.table_cells import NONE, SYSTEM_NAMES, Table, amount, decimals, ours, percent, seeds
 
 NAMES = {
     "drag": "drag 0.3",
@@ -19,7 +17,8 @@ SHIPPED = "The policy that ships, `adapt.fewshot` as it comes."
 
 def in_other_targets(evidence):
     """Targets × aircraft: error before and after, and how much of what could be gained was."""
-    lines = [("drag", samples, "") for samples in FEWEST] + [(change, FEW, "") for change in CHANGES]
+    lines = [("drag", samples, "") for samples in sorted((*FEWEST, FEW))]
+    lines += [(change, FEW, "") for change in CHANGES if change != "drag"]
     lines += [(change, NOISY, "-noisy") for change in CHANGES]
     rows = []
     for change, samples, noisy in lines:
@@ -74,28 +73,32 @@ def in_simulators(evidence):
 
 
 def plain(evidence, name, column="error"):
-    """The mean of a column over seeds, without its spread."""
+    """The mean of a column over seeds, without its spread; of `error` with the share that succeeds, where some fail."""
     numbers = evidence.spread(name, column)
-    if numbers is None or numbers.failed == numbers.seeds:
+    if numbers is None or numbers.failed:
         return amount(numbers)
-    return f"{numbers.mean:.{decimals(numbers.mean)}f}"
+    success = evidence.rows(name).success.mean() if column == "error" else 1.0
+    return f"{numbers.mean:.{decimals(numbers.mean)}f}" + (f" ({percent(success)})" if success < 1 else "")
 
 
 def gap_closed(rows, bound):
-    """(zero-shot - few-shot) / (zero-shot - bound): mean and least over the seeds that have all three."""
+    """(zero-shot - few-shot) / (zero-shot - bound): mean and least over the seeds where there is a gap to close."""
     if rows is None:
         return NONE
-    closed = ((rows.zero_shot - rows.error) / (rows.zero_shot - rows[bound])).dropna()
+    cost = rows.zero_shot - rows[bound]
+    closed = ((rows.zero_shot - rows.error) / cost.where(cost > 0)).dropna()
     return NONE if closed.empty else f"{closed.mean():.2f} ({closed.min():.2f})"
 
 
 def regret(evidence, names, chosen):
-    """By how much the mean error of the chosen residual is above that of the best kind, in words."""
-    best = min((numbers.mean for name in names if (numbers := evidence.spread(name)) and not numbers.failed), default=0)
-    numbers = evidence.spread(chosen)
-    if not best or numbers is None or math.isnan(numbers.mean):
+    """By how much the mean error of the chosen residual is above that of the best kind that flies as much, in words."""
+    numbers, rows = evidence.spread(chosen), evidence.rows(chosen)
+    if numbers is None or numbers.failed:
         return NONE
-    return f"{max(0.0, numbers.mean / best - 1):.0%}".replace("%", " %")
+    flying = [name for name in names if evidence.rows(name) is not None]
+    flying = [name for name in flying if evidence.rows(name).success.mean() >= rows.success.mean()]
+    errors = [evidence.spread(name).mean for name in flying if not evidence.spread(name).failed]
+    return f"{numbers.mean / min(errors) - 1:+.0%}".replace("%", " %") if errors else NONE
 
 
 LAYOUTS = {"targets": in_other_targets, "kinds": by_kind, "simulators": in_simulators}

@@ -69,8 +69,10 @@ def distance(old, new, evaluation):
         return None
     count, steps = evaluation.actions.shape[:2]
     states = evaluation.states[:, :-1].flatten(0, 1)
-    rows = evaluation.episodes.repeat_interleave(steps, 0)
-    step = torch.arange(steps, device=states.device).repeat(count)
+    flown = states.isfinite().all(-1)  # a lost robot may be anywhere
+    rows = evaluation.episodes.repeat_interleave(steps, 0)[flown]
+    step = torch.arange(steps, device=states.device).repeat(count)[flown]
+    states = states[flown]
     window = task.window(states, task.reference(rows, step, states))
     actions = [policy.network(task.observe(states), window)[:, 0] for policy in (old, new)]
     return float((actions[0] - actions[1]).square().mean().sqrt())

@@ -41,12 +41,16 @@ class CompiledDynamics:
         dynamics: have `system`, `dt` and `casadi()`; later changes of them don't count.
 
     Raises:
-        CompilerError: no compiler, or one that fails.
+        CompilerError: no compiler, one that fails, or a library that can't be loaded.
     """
 
     def __init__(self, dynamics):
         self.dynamics, self.system, self.dt = dynamics, dynamics.system, dynamics.dt
-        library = ctypes.CDLL(str(shared_library(_source(dynamics.casadi()))))
+        path = shared_library(_source(dynamics.casadi()))
+        try:
+            library = ctypes.CDLL(str(path))
+        except OSError as error:  # a folder that programs may not be run from, or a damaged file
+            raise CompilerError(f"{path}: can't be loaded ({error})") from None
         self._forward, self._backward = (getattr(library, f"{name}_batch") for name in (FORWARD, BACKWARD))
         for function, pointers in ((self._forward, 3), (self._backward, 5)):
             function.argtypes, function.restype = [ctypes.c_longlong, *[ctypes.c_void_p] * pointers], None

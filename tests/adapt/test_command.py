@@ -282,3 +282,8 @@ def test_a_reader_that_leaves_early_is_no_error_of_ours():
     assert answer.returncode == 141
     assert answer.stdout == 10 * "a"
     assert answer.stderr == ""
+
+
+def test_without_git_a_result_has_no_commit(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert command.environment(0, 1)["commit"] == ""

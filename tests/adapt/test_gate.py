@@ -70,6 +70,25 @@ def test_to_fly_where_the_old_one_crashed_is_a_gain_whatever_the_error():
     assert decide([flown(around(1.0), around(1.0), old_succeeded=~ALL)]).accepted
 
 
+def first(count):
+    """The first `count` of the episodes."""
+    return torch.arange(20) < count
+
+
+def test_a_few_flights_that_both_survive_tell_nothing():
+    verdict = decide([flown(around(1.0), around(0.5), "fit", first(8), first(8))])
+    assert not verdict.accepted
+    assert verdict.reason == "too few flights succeed in fit to tell which policy is better"
+
+
+def test_flights_that_are_saved_in_one_model_are_no_evidence_of_smaller_errors_in_another():
+    saved = flown(around(1.0), around(1.0), "other", ~ALL)
+    assert decide([flown(around(1.0), around(0.5)), saved]).accepted
+    verdict = decide([flown(around(1.0), around(0.999)[torch.randperm(20)]), saved])
+    assert not verdict.accepted
+    assert "0.95 is asked for" in verdict.reason
+
+
 @pytest.fixture(scope="module")
 def cart():
     return load_policy("cartpole")
@@ -97,6 +116,16 @@ def test_actions_that_change_too_much_are_not_even_flown(cart, monkeypatch):
     chosen, verdict = Gate(cart, {"the fit": make_dynamics("cartpole")}, episodes=4).choose(spoilt(cart, 0.02))
     assert chosen is cart
     assert "actions differ" in verdict.reason
+
+
+def test_where_a_robot_was_lost_nothing_is_compared(cart):
+    other = spoilt(cart, 0.02)
+    flight = evaluate(
+        cart.actor(), make_dynamics("cartpole"), cart.task, flights.test_episodes(cart.task, 2, "validation")
+    )
+    whole = distance(cart, other, flight)
+    flight.states[1, 5:] = torch.nan
+    assert 0 < distance(cart, other, flight) < 2 * whole
 
 
 def test_part_way_is_between_and_the_whole_way_is_the_new_policy(cart):

@@ -151,7 +151,9 @@ def test_hover_alone_says_what_thrust_cannot_be_told_from_and_in_which_direction
     assert undoing["gravity"] == pytest.approx(-9.81 * 0.9 / 0.723, rel=2e-3)
     assert undoing["push_z"] == pytest.approx(9.81 * 0.9 / 0.723, rel=2e-3)
     assert undoing["thrust_loss"] == pytest.approx(-0.9 / 0.723, rel=2e-3)
-    (table,) = report.parameter_table({"parameters": {"mass": {"value": 0.8, "standard_error": 0}}, "alike": fit.alike})
+    (table,) = report.parameter_table(
+        {"parameters": {"mass": {"value": 0.8, "standard_error": 0, "model": 0.7}}, "alike": fit.alike}
+    )
     assert "so much undoes +1 of it" in table
     assert "gravity -12.2" in table
 

@@ -81,6 +81,14 @@ def test_without_a_compiler_the_equations_are_used_and_the_reason_is_told(monkey
     assert fastest(dynamics) == (dynamics, "no C compiler found (tried gcc)")
 
 
+def test_a_library_that_cannot_be_loaded_is_as_good_as_no_compiler(monkeypatch, tmp_path):
+    (tmp_path / "damaged.so").write_text("no machine code")
+    monkeypatch.setattr("policies.compiled_dynamics.shared_library", lambda source: tmp_path / "damaged.so")
+    dynamics, reason = fastest(make_dynamics("cartpole"))
+    assert not isinstance(dynamics, CompiledDynamics)
+    assert "damaged.so: can't be loaded" in reason
+
+
 def test_what_has_no_equations_or_another_gradient_is_left_as_it_is(flown):
     class Other:
         system = make_dynamics("cartpole").system
