@@ -99,13 +99,9 @@ def gap(rows, name):
 
 
 def _bound(rows):
-    """Key and name of the error that can be reached: by an oracle where every case has one."""
-    adapted = rows[rows.source_error.notna()]
-    return (
-        ("oracle", "oracle")
-        if len(adapted) and (adapted.oracle_success.notna()).all()
-        else ("source", "error in the model")
-    )
+    """Key and name of the error that can be reached: by an oracle where every case that adapted has one."""
+    told = rows[rows.source_error.notna()].oracle_error.notna()
+    return ("oracle", "oracle") if len(told) and told.all() else ("source", "error in the model")
 
 
 def save(rows, path):
