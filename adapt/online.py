@@ -5,6 +5,7 @@ newest flight and the policy fine-tuned in the corrected model, in another proce
 is swapped where the gate is sure that the new one is better.
 """
 
+from concurrent.futures import BrokenExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Annotated
@@ -27,8 +28,8 @@ class Options:
     action, error), swaps.csv (each lesson, and what the gate said), policy.safetensors (the last) and online.png.
     """
 
-    system: str = "quadrotor"
-    """Robot: cartpole, quadrotor or fixed_wing."""
+    system: str | None = None
+    """Robot: cartpole, quadrotor or fixed_wing (default: what --vehicle is, else quadrotor)."""
     target: Repeatable = ()
     """What is different, and from when on: NAME=VALUE@SECONDS such as wind=3@40; without @ from the start. What has
     begun stays. May be repeated (default: mass=x1.2 after a third of the flight and wind=3 after two thirds)."""
@@ -53,7 +54,7 @@ class Options:
     set: str | None = None
     """Family of references (quadrotor: paper, fast, circle, lemniscate, line, hover, or a CSV of waypoints)."""
     vehicle: str | None = None
-    """Parameters of your own robot: a shipped name such as crazyflie, or a TOML file."""
+    """Parameters of your own robot: a shipped name, crazyflie (a quadrotor) or j3cub (a fixed wing), or a TOML file."""
     seed: int = 0
     """Seed of everything that is drawn."""
     out: str | None = None
@@ -64,6 +65,7 @@ class Options:
 
 def main(options):
     """Check the options, fly and learn, fly without learning, print, write."""
+    options = command.with_robot(options)
     _check(options)
     command.check_seed(options.seed)
     command.set_threads(1)
@@ -73,14 +75,22 @@ def main(options):
     command.write_json(folder / "config.json", {"options": asdict(options), **command.environment(options.seed, 1)})
 
     from adapt.online_flight import ContinuousFlight
+    from adapt.online_loop import KILLED
 
     begin = partial(ContinuousFlight, policy.task, periods=periods, exploration=options.exploration, seed=options.seed)
     with command.interrupts_noted() as interrupted:
-        flight, learner, last = _fly(options, begin(schedule), policy, settings, timing, interrupted)
-        flights = {"adapted": flight} | ({} if interrupted() else _compared(begin, schedule, policy, interrupted))
-        _write(options, folder, flights, schedule, learner, last)
+        flight = begin(schedule)
+        learner, failure = _fly(options, flight, policy, settings, timing, interrupted)
+        complete = not failure and not interrupted()
+        flights = {"adapted": flight} | (_compared(begin, schedule, policy, interrupted) if complete else {})
+        _write(options, folder, flights, schedule, learner)
+        flown = f"what was flown, {flight.time:.4g} s, is in {folder}"
+        if failure and not isinstance(failure, BrokenExecutor):
+            raise failure
         if interrupted():
-            raise KeyboardInterrupt(f"what was flown, {flight.time:.4g} s, is in {folder}")
+            raise KeyboardInterrupt(flown)
+        if failure:
+            raise InputError(f"{KILLED}; {flown}")
     files = "metrics.json, flight.csv, swaps.csv, policy.safetensors, online.png"
     print(f"results in {folder}/: {files}")
 
@@ -131,36 +141,41 @@ def _default_folder(options):
 
 
 def _fly(options, flight, policy, settings, timing, interrupted):
-    """The flight that learns, with a bar of simulated seconds; the learner and the last policy."""
+    """Fly and learn, with a bar of simulated seconds; the learner, and what ended the flight early or None."""
     from tqdm import tqdm
 
     from adapt import online_loop
 
     def told(lesson):
         seen = f"{lesson['due']:.4g} s: swapped; found {lesson['found']}; {lesson['reason']}"
-        tqdm.write(f"{seen} ({lesson['seconds']:.1f} s of learning)")
+        tqdm.write(f"{seen} (the lesson took {lesson['seconds']:.1f} s)")
 
     form = "{desc}: {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} s flown [{elapsed}<{remaining}]"
     with online_loop.background(policy, settings) as executor:
         learner = online_loop.Learner(policy, executor, settings, timing)
         period = policy.task.system.dt  # whole periods are counted, whose sum is never off
         with tqdm(total=flight.periods, unit_scale=period, desc="flying", bar_format=form) as bar:
-            last = online_loop.fly(flight, policy, learner, interrupted, bar.update, told)
-    return flight, learner, last
+            try:
+                online_loop.fly(flight, policy, learner, interrupted, bar.update, told)
+            except Exception as error:  # whatever a lesson ends in, what was flown is to be written
+                return learner, error
+    return learner, None
 
 
 def _compared(begin, schedule, policy, interrupted):
-    """The same flight without learning, and where nothing changes either."""
+    """The same flight without learning; if something changes in mid-flight, one in which nothing does, too."""
     from adapt.online_loop import fly
     from adapt.online_targets import Schedule
 
-    flights = {"unadapted": begin(schedule), "undisturbed": begin(Schedule(schedule.phases[:1]))}
+    flights = {"unadapted": begin(schedule)}
+    if schedule.changes:
+        flights["undisturbed"] = begin(Schedule(schedule.phases[:1]))
     for flight in flights.values():
         fly(flight, policy, stopped=interrupted)
     return {} if interrupted() else flights
 
 
-def _write(options, folder, flights, schedule, learner, last):
+def _write(options, folder, flights, schedule, learner):
     import pandas as pd
 
     from adapt import online_report
@@ -168,7 +183,7 @@ def _write(options, folder, flights, schedule, learner, last):
     from policies.files import whole
 
     tables = {name: flight.table() for name, flight in flights.items()}
-    task = learner.policy.task
+    last, task = learner.policy, learner.policy.task
     for name, table in (("flight", tables["adapted"]), ("swaps", pd.DataFrame(learner.lessons))):
         with whole(folder / f"{name}.csv") as partial:
             table.to_csv(partial, index=False)

@@ -21,8 +21,9 @@ APART = 1000  # between the seeds of two references: flights of neighbouring see
 class ContinuousFlight:
     """A robot in the target of a `Schedule`, one control period after another.
 
-    Two flights of the same seed have the same references, the same exploration and the same errors of their sensors,
-    whoever flies them.
+    Two flights of the same seed have the same references in the same order, the same exploration at the same times, and
+    the same draws of their sensors' errors in the same order, whoever flies them. When a reference begins is up to the
+    flight: a robot that arrives sooner, or is lost, is sooner on the next.
 
     Args:
         task: of the policy; its references are drawn from the test split.
@@ -35,7 +36,8 @@ class ContinuousFlight:
         longest = round(LONGEST / task.system.dt)
         self.task, self.schedule = replace(task, steps=min(periods, longest)), schedule
         self.exploration, self.seed, self.periods = exploration, seed, periods
-        self.noise, self.sensors = (torch.Generator().manual_seed(seed) for _ in range(2))
+        # The seed of the exploration is below 0, where none of a user's is: its draws aren't those of the sensors.
+        self.noise, self.sensors = (torch.Generator().manual_seed(number) for number in (-1 - seed, seed))
         names = task.system.State._fields
         self.places = [i for i, name in enumerate(names) if name in GROUPS["position"]]
         self.period, self.leg, self.losses, self.legs, self._rows = 0, -1, 0, [], []

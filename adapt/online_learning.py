@@ -3,7 +3,6 @@
 A lesson is a function of its `Job` alone, so that it may run in another process.
 """
 
-import time
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -70,15 +69,15 @@ class Lesson:
     reason: str
     found: str = ""  # what the model lacks, in words
     verdict: Verdict | None = None
-    seconds: float = 0.0  # that it took
 
 
 def learn(job, settings):
-    """The `Lesson` of a job."""
-    began = time.perf_counter()
+    """The `Lesson` of a job; one that can't be carried out has its reason, and the present policy flies on."""
     torch.set_num_threads(1)
-    lesson = _learn(job, settings)
-    return replace(lesson, seconds=time.perf_counter() - began)
+    try:
+        return _learn(job, settings)
+    except InputError as error:
+        return Lesson(job.residual, False, None, f"failed: {error}")
 
 
 def _learn(job, settings):

@@ -2,15 +2,19 @@
 
 A lesson that begins at time t is over at t + `latency`, whatever the machine needs for it: the flight waits for a
 worker that is later, and a result that is earlier waits for its time. So the same seed gives the same flight on any
-machine, and the seconds that lessons really took are told beside it.
+machine, and the seconds that lessons really took are told beside it: from when a lesson was asked for to its result,
+with the wait for the worker, which carries a lesson that is given up to its end before it begins the next.
 """
 
 import math
+import multiprocessing
+import os
 import signal
-from concurrent.futures import ProcessPoolExecutor
+import threading
+import time as clock
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
 
 from adapt.online_learning import Job, Settings, learn, training_episodes
 from adapt.online_window import Window
@@ -19,6 +23,7 @@ from envs.dynamics import Dynamics
 from envs.errors import InputError
 
 ROUNDING = 1e-9  # [s] by which sums of control periods may be off
+KILLED = "the process that lessons run in was killed, perhaps as memory ran out"
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,7 @@ class Learner:
         self.source = Dynamics(system)
         self.window, self.residual, self.fitted_at = Window(system, timing.window), None, 0.0
         self.pending, self.lessons, self._next = None, [], timing.every
+        self._asked, self._ended = 0.0, []
 
     def attend(self, time):
         """Take a result whose time has come, and begin a lesson if it is time for one; the new policy or None.
@@ -80,7 +86,9 @@ class Learner:
         stale = self.window.changed > self.fitted_at
         number = len(self.lessons)
         job = Job(self.policy, self.residual, stale, self.window.transitions(), number)
+        self._asked, self._ended = clock.perf_counter(), (ended := [])
         self.pending = self.executor.submit(learn, job, self.settings)
+        self.pending.add_done_callback(lambda _: ended.append(clock.perf_counter()))
         since = self.window.changed if self.window.changed > -math.inf else None
         rows = {"transitions": len(self.window), "change": since}
         self.lessons.append({"begun": time, "due": time + self.timing.latency, **rows})
@@ -89,12 +97,13 @@ class Learner:
         if self.pending is None or time + ROUNDING < self.lessons[-1]["due"]:
             return None
         lesson, self.pending = self.pending.result(), None
+        seconds = min([*self._ended, clock.perf_counter()]) - self._asked  # a result is there just before its callback
         if lesson.fitted:
             self.residual, self.fitted_at = lesson.residual, self.lessons[-1]["begun"]
         verdict = lesson.verdict
         said = {"found": lesson.found, "accepted": lesson.policy is not None, "reason": lesson.reason}
         sure = {"confidence": verdict and verdict.confidence, "gain": verdict and verdict.gain}
-        self.lessons[-1] |= said | sure | {"fitted": lesson.fitted, "seconds": lesson.seconds}
+        self.lessons[-1] |= said | sure | {"fitted": lesson.fitted, "seconds": seconds}
         if lesson.policy is None:
             return None
         self.policy = lesson.policy
@@ -125,13 +134,30 @@ def fly(flight, policy, learner=None, stopped=lambda: False, progress=lambda: No
 def background(policy, settings=Settings()):
     """A process that lessons run in, ready: what takes seconds to import, or to draw once, is there.
 
-    Ctrl-C is left to the flight.
+    Ctrl-C is left to the flight. SIGTERM ends the process, and so does the end of the one that began it.
+
+    Raises:
+        InputError: it was killed before it was ready.
     """
-    with ProcessPoolExecutor(1, get_context("spawn"), _alone) as executor:
-        executor.submit(training_episodes, policy.task, settings.episodes).result()
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _attach) as executor:
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited: deaf to Ctrl-C while it still imports, too
+        ready = executor.submit(training_episodes, policy.task, settings.episodes)
+        signal.signal(signal.SIGINT, before)
+        try:
+            ready.result()
+        except BrokenExecutor:
+            raise InputError(f"{KILLED}; nothing was flown") from None
         yield executor
 
 
-def _alone():
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
+def _attach():
+    """Make this process deaf to Ctrl-C, and let it end by SIGTERM or with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    threading.Thread(target=_follow, daemon=True).start()
+
+
+def _follow():
+    """Leave when the parent has ended, at once: a lesson would run on, and nobody waits for it."""
+    multiprocessing.parent_process().join()
+    os._exit(1)

@@ -27,7 +27,7 @@ def around(schedule, tables, dt):
     some times than at others; `path` is the same ratio where nothing changes, and `net` is the ratio without that.
     """
     said, flown = [], tables["adapted"].error.to_numpy()
-    ends = [phase.begins for phase in schedule.changes[1:]] + [len(flown) * dt]
+    ends = [*(phase.begins for phase in schedule.changes), len(flown) * dt][1:]
     for phase, end in zip(schedule.changes, ends, strict=True):
         spans = {"before": (phase.begins - BEFORE, phase.begins)}
         spans["after"] = (phase.begins + LATER, phase.begins + LATER + AFTER)
@@ -65,12 +65,17 @@ def running_mean(errors, dt):
 
 
 def timing(lessons, latency):
-    """How many lessons, swaps, seconds; how often a lesson took longer than the flight allowed for."""
+    """How many lessons, swaps, seconds; how often a result came later than the flight allowed for.
+
+    Lessons are those whose result was taken. One that is given up at a change has a reason and no seconds; one that was
+    under way when the flight ended is unfinished and has neither.
+    """
     done = [one for one in lessons if "seconds" in one]
     seconds = [one["seconds"] for one in done]
     return {
         "lessons": len(done),
-        "given_up": len(lessons) - len(done),
+        "given_up": sum("reason" in one and "seconds" not in one for one in lessons),
+        "unfinished": sum("reason" not in one and "seconds" not in one for one in lessons),
         "swaps": sum(one["accepted"] for one in done),
         "latency": latency,
         "median_seconds": float(np.median(seconds)) if done else None,
@@ -104,11 +109,13 @@ def _cell(value):
 
 
 def _learned(said):
+    others = {"given up": said["given_up"], "unfinished at the end": said["unfinished"]}
+    others = "".join(f", {number} {what}" for what, number in others.items() if number)
     if not said["lessons"]:
-        return "no lesson was finished"
+        return f"no lesson was finished{others}"
     late = f"{said['late']} of {said['lessons']} took longer than the {said['latency']:g} s that the flight allows for"
     took = f"{said['median_seconds']:.2f} s in the median, {said['most_seconds']:.2f} s at most"
-    return f"{said['lessons']} lessons, {said['swaps']} swaps; a lesson took {took}; {late}"
+    return f"{said['lessons']} lessons, {said['swaps']} swaps{others}; a lesson took {took}; {late}"
 
 
 def draw(tables, schedule, lessons, task, path):

@@ -2,12 +2,14 @@
 
 import json
 from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 
 import pandas as pd
 import pytest
 
 from adapt import command, online_loop, online_report
+from adapt.online_learning import Lesson
 from policies.checkpoints import load_policy
 
 FILES = {"config.json", "metrics.json", "flight.csv", "swaps.csv", "policy.safetensors", "online.png"}
@@ -61,7 +63,7 @@ def test_it_leaves_everything_that_it_promises_and_nothing_else(call, quick, tmp
 def test_the_same_seed_gives_the_same_flight(call, quick, tmp_path, monkeypatch):
     monkeypatch.setattr(online_report, "draw", lambda *_: None)
     for name in "ab":
-        call("online", *quick, "--exploration", 0.1, "--out", tmp_path / name)
+        call("online", *quick, "--seconds", 2.5, "--exploration", 0.1, "--out", tmp_path / name)
     assert (tmp_path / "a/flight.csv").read_bytes() == (tmp_path / "b/flight.csv").read_bytes()
 
 
@@ -80,6 +82,71 @@ def test_what_was_flown_is_kept_when_it_is_interrupted(call, quick, tmp_path, mo
     assert set(read(tmp_path / "run")["flights"]) == {"adapted"}
 
 
+@pytest.fixture
+def second_lesson_raises(monkeypatch):
+    """Lessons of which the second ends in an error; the first finds nothing."""
+
+    def set_up(error):
+        class Fails:
+            asked = 0
+
+            def submit(self, learn, job, settings):
+                self.asked, future = self.asked + 1, Future()
+                if self.asked == 2:
+                    future.set_exception(error)
+                else:
+                    future.set_result(Lesson(None, False, None, "the model explains what is flown"))
+                return future
+
+        @contextmanager
+        def failing(policy, settings):
+            yield Fails()
+
+        monkeypatch.setattr(online_loop, "background", failing)
+
+    return set_up
+
+
+def test_what_was_flown_is_kept_when_the_process_of_the_lessons_is_killed(
+    call, quick, tmp_path, second_lesson_raises, monkeypatch
+):
+    monkeypatch.setattr(online_report, "draw", lambda *_: None)
+    second_lesson_raises(BrokenProcessPool("gone"))
+    answer = call("online", *quick, "--out", tmp_path / "run")
+    assert answer.status == 2
+    said = "online: the process that lessons run in was killed, perhaps as memory ran out; what was flown, 3 s, is in "
+    assert answer.errors[-1].startswith(said)
+    assert len(pd.read_csv(tmp_path / "run/flight.csv")) == 30
+    metrics = read(tmp_path / "run")
+    assert set(metrics["flights"]) == {"adapted"}
+    assert (metrics["learning"]["lessons"], metrics["learning"]["unfinished"]) == (1, 1)
+
+
+def test_what_was_flown_is_kept_when_a_lesson_ends_in_an_error_of_ours(
+    call, quick, tmp_path, second_lesson_raises, monkeypatch
+):
+    monkeypatch.setattr(online_report, "draw", lambda *_: None)
+    second_lesson_raises(ZeroDivisionError("ours"))
+    with pytest.raises(ZeroDivisionError, match="ours"):
+        call("online", *quick, "--out", tmp_path / "run")
+    assert len(pd.read_csv(tmp_path / "run/flight.csv")) == 30
+
+
+def test_a_target_that_never_changes_is_flown_with_and_without_learning(call, quadrotor_file, tmp_path):
+    options = ("--policy", quadrotor_file, "--target", "wind=1", "--seconds", 1)
+    assert call("online", *options, "--out", tmp_path / "run").status == 0
+    assert {path.name for path in (tmp_path / "run").iterdir()} == FILES
+    assert set(read(tmp_path / "run")["flights"]) == {"adapted", "unadapted"}
+    assert read(tmp_path / "run")["changes"] == []
+
+
+def test_a_vehicle_says_what_robot_it_is(call, tmp_path, monkeypatch):
+    monkeypatch.setattr(online_report, "draw", lambda *_: None)
+    answer = call("online", "--vehicle", "j3cub", "--seconds", 0.2, "--out", tmp_path / "run")
+    assert answer.status == 0, answer
+    assert json.loads((tmp_path / "run/config.json").read_text())["options"]["system"] == "fixed_wing"
+
+
 def test_the_default_target_fits_into_any_flight(call, quadrotor_file, tmp_path, monkeypatch):
     monkeypatch.setattr(online_report, "draw", lambda *_: None)
     options = ("--policy", quadrotor_file, "--seconds", 3, "--updates", 1)
@@ -87,9 +154,9 @@ def test_the_default_target_fits_into_any_flight(call, quadrotor_file, tmp_path,
     assert [one["begins"] for one in read(tmp_path / "run")["changes"]] == pytest.approx([1, 2])
 
 
-def test_a_cart_that_balances_learns_too(call, cartpole_file, tmp_path, monkeypatch):
+def test_a_cart_that_balances_learns_too(call, tmp_path, monkeypatch):
     monkeypatch.setattr(online_report, "draw", lambda *_: None)
-    options = ("--system", "cartpole", "--policy", cartpole_file, "--target", "push=0.5@1", "--updates", 2)
+    options = ("--system", "cartpole", "--target", "push=0.5@1", "--updates", 2)
     assert call("online", *options, "--seconds", 3, "--latency", 0.5, "--out", tmp_path / "run").status == 0
     assert read(tmp_path / "run")["unit"] == "m/s"
 

@@ -71,6 +71,13 @@ def test_exploration_moves_the_action_and_is_the_same_in_whatever_is_flown(rough
     assert np.allclose(noisy.action_thrust - 0.1, other.action_thrust - 0.2, atol=1e-6)
 
 
+@pytest.mark.parametrize("seed", [0, 7, 2**63 - 1])
+def test_exploration_and_sensors_draw_different_numbers(rough_quadrotor, seed):
+    flight = ContinuousFlight(rough_quadrotor.task, parse_schedule([], 1e3, rough_quadrotor.task), 1, seed=seed)
+    one, other = (torch.randn(20, generator=generator) for generator in (flight.noise, flight.sensors))
+    assert not torch.isclose(one, other).any()
+
+
 def test_transitions_are_what_was_measured_and_the_table_what_was_true(rough_quadrotor):
     flight, rows = flown(rough_quadrotor, ["noise=1"], periods=10)
     state, action, following, leg = rows[3]

@@ -44,7 +44,7 @@ def job(policy):
 
 def test_a_payload_is_found_and_the_new_policy_carries_it_better(policy, window, job):
     lesson = learn(job(window("mass=x1.2", 10)), BRIEF)
-    assert lesson.fitted and lesson.verdict.accepted and lesson.seconds > 0
+    assert lesson.fitted and lesson.verdict.accepted
     assert lesson.found == "mass 0.868"
     heavy, tests = make_dynamics("quadrotor", "mass=x1.2"), draw_tests(policy.task, 10)
     errors = [evaluate(one.actor(), heavy, policy.task, tests).summary["mean"] for one in (policy, lesson.policy)]
@@ -52,7 +52,9 @@ def test_a_payload_is_found_and_the_new_policy_carries_it_better(policy, window,
 
 
 def test_the_same_job_gives_the_same_lesson(window, job):
-    one, same = (learn(job(window("mass=x1.2")), BRIEF).policy.network.state_dict() for _ in range(2))
+    one, same = (
+        learn(job(window("mass=x1.2", 10)), replace(BRIEF, updates=10)).policy.network.state_dict() for _ in range(2)
+    )
     assert all(torch.equal(one[name], same[name]) for name in one)
 
 
@@ -91,6 +93,17 @@ def test_data_that_nothing_can_be_fitted_to_end_in_a_reason(window, job):
     lesson = learn(job(window("mass=x1.2", 5)), BRIEF)
     assert lesson.policy is None
     assert lesson.reason.startswith("nothing fitted: transitions: 5 transitions")
+
+
+def test_a_lesson_that_fails_ends_in_a_reason_and_keeps_the_residual(policy, window, job, monkeypatch):
+    residual, _ = fit_residual(window("mass=x1.2", 20), Dynamics(policy.task.system), "parameters")
+
+    def fails(*_):
+        raise InputError("it diverged")
+
+    monkeypatch.setattr("adapt.online_learning.tune", fails)
+    lesson = learn(job(window("mass=x1.2"), residual), BRIEF)
+    assert (lesson.policy, lesson.residual, lesson.reason) == (None, residual, "failed: it diverged")
 
 
 def test_what_costs_nothing_is_to_hold_the_robot_that_was_found(policy, window):

@@ -1,11 +1,19 @@
 """Flying and learning at the same time: when lessons begin, and when their results are flown."""
 
 import copy
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
 from concurrent.futures import Future
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from adapt import online_loop
 from adapt.online_flight import ContinuousFlight
 from adapt.online_learning import Lesson, Settings
 from adapt.online_loop import Learner, Timing, background, fly
@@ -27,7 +35,7 @@ class Scripted:
 
 
 def refused(job):
-    return Lesson(None, False, None, "the model explains what is flown", seconds=0.1)
+    return Lesson(None, False, None, "the model explains what is flown")
 
 
 def still(policy):
@@ -64,7 +72,7 @@ def test_a_lesson_has_the_newest_window_and_a_first_one_waits_for_enough_transit
 
 def test_a_new_policy_flies_from_the_end_of_its_lesson_on_and_not_before(run, rough_quadrotor):
     zero = still(rough_quadrotor)
-    flight, learner, executor, last = run(lambda job: Lesson(None, False, zero, "better", seconds=0.1), latency=2.0)
+    flight, learner, executor, last = run(lambda job: Lesson(None, False, zero, "better"), latency=2.0)
     plain = run(refused)[0].table()
     table = flight.table()
     assert table[:30].equals(plain[:30])
@@ -80,6 +88,21 @@ def test_a_lesson_under_way_when_a_change_is_noticed_is_given_up(run):
     assert learner.lessons[1]["reason"] == "given up: a change at 3 s was noticed"
     assert learner.lessons[2]["change"] == pytest.approx(3.0) and len(executor.jobs[2].window) == 10
     assert [job.stale for job in executor.jobs] == [False, False, True]
+
+
+def test_the_seconds_of_a_lesson_are_those_from_when_it_was_asked_for_to_its_result(rough_quadrotor):
+    class Busy:
+        """An executor whose worker is busy for 0.2 s before it begins, as with a lesson that was given up."""
+
+        def submit(self, learn, job, settings):
+            future = Future()
+            threading.Timer(0.2, lambda: future.set_result(refused(job))).start()
+            return future
+
+    flight = ContinuousFlight(rough_quadrotor.task, parse_schedule([], 10, rough_quadrotor.task), 25)
+    learner = Learner(rough_quadrotor, Busy(), Settings(), Timing(every=1.0, latency=0.5))
+    fly(flight, rough_quadrotor, learner, progress=lambda: time.sleep(0.1) if 15 > flight.period > 10 else None)
+    assert 0.2 <= learner.lessons[0]["seconds"] < 0.38, "0.4 s were flown before the result was taken"
 
 
 def test_a_residual_from_after_the_change_is_not_stale(run, rough_quadrotor):
@@ -119,6 +142,56 @@ def test_a_window_too_short_for_a_fit_is_refused(rough_quadrotor):
     Timing(window=1.0).check(system)
     with pytest.raises(InputError, match=r"--window 0.9: a fit needs 10 transitions, 1 s of quadrotor"):
         Timing(window=0.9).check(system)
+
+
+PARENT = """
+import multiprocessing, time
+from adapt import online_loop
+
+def work(pipe):
+    online_loop._attach()
+    pipe.send("ready")
+    time.sleep(60)
+
+def begun():
+    here, there = multiprocessing.Pipe()
+    process = context.Process(target=work, args=(there,))
+    process.start()
+    here.recv()
+    print(process.pid, flush=True)
+    return process
+
+context = multiprocessing.get_context("fork")
+first = begun()
+input()
+first.join(10)
+print(first.exitcode, flush=True)
+begun()
+time.sleep(60)
+"""
+
+
+def test_a_worker_leaves_ctrl_c_to_the_flight_and_ends_by_sigterm_or_with_its_parent():
+    pipes = {
+        "stdin": subprocess.PIPE,
+        "stdout": subprocess.PIPE,
+        "text": True,
+        "cwd": Path(online_loop.__file__).parents[1],
+    }
+    with subprocess.Popen([sys.executable, "-c", PARENT], **pipes) as parent:
+        first = int(parent.stdout.readline())
+        os.kill(first, signal.SIGINT)
+        time.sleep(0.2)
+        os.kill(first, signal.SIGTERM)
+        print(file=parent.stdin, flush=True)
+        assert int(parent.stdout.readline()) == -signal.SIGTERM
+        second = int(parent.stdout.readline())
+        parent.kill()
+        try:
+            parent.communicate(timeout=10)  # ends when nobody can write any more
+        except subprocess.TimeoutExpired:
+            os.kill(second, signal.SIGKILL)
+            pytest.fail("the worker outlived its parent")
 
 
 @pytest.mark.slow

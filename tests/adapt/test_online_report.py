@@ -53,9 +53,10 @@ def test_the_running_mean_is_that_of_the_last_second():
 
 
 def test_lessons_that_took_too_long_are_counted():
-    lessons = [{"accepted": True, "seconds": 1.0}, {"accepted": False, "seconds": 3.0}, {"reason": "given up"}]
-    said = timing(lessons, 2.0)
-    assert (said["lessons"], said["given_up"], said["swaps"], said["late"]) == (2, 1, 1, 1)
+    done = [{"accepted": True, "seconds": 1.0, "reason": ""}, {"accepted": False, "seconds": 3.0, "reason": ""}]
+    said = timing([*done, {"reason": "given up"}, {"reason": "given up"}, {"due": 31.0}], 2.0)
+    assert (said["lessons"], said["given_up"], said["unfinished"]) == (2, 2, 1)
+    assert (said["swaps"], said["late"]) == (1, 1)
     assert (said["median_seconds"], said["most_seconds"]) == (2.0, 3.0)
     assert timing([], 2.0)["median_seconds"] is None
 
@@ -74,8 +75,14 @@ def test_the_tables_tell_every_change_and_the_time_that_lessons_took():
     assert "mass=x1.2 at 10 s" in said and "wind=3 at 20 s" in said
     assert "1 lessons, 1 swaps; a lesson took 1.00 s in the median" in said
     assert "0 of 1 took longer than the 2 s" in said
+    more = text(metrics | {"learning": timing([*lessons, {"reason": "given up"}, {"due": 31.0}], 2.0)})
+    assert "1 lessons, 1 swaps, 1 given up, 1 unfinished at the end; a lesson took" in more
     empty = text(metrics | {"changes": [], "learning": timing([], 2.0)})
     assert "no lesson was finished" in empty
+
+
+def test_a_flight_in_which_nothing_changes_has_no_ratios():
+    assert around(parse_schedule(["wind=1"], 30, TASK), {"adapted": table(0.01)}, 0.1) == []
 
 
 def test_the_picture_shows_the_flights_the_changes_and_the_swaps(tmp_path, monkeypatch):
