@@ -215,7 +215,8 @@ def adapt(
     _check_flown(target, transitions)
     check(transitions, source.system, residuals.MINIMUM)
     transitions, mends = mended(transitions)
-    keep("transitions", transitions)
+    if mends:
+        keep("transitions", transitions)
     notes += [*mends, *check_labels(transitions, source)]
     clock.next("fit")
     residual, fit = residuals.fit_residual(transitions, source, kind, seed)

@@ -69,10 +69,9 @@ def test_a_residual_given_is_the_one_that_is_planned_in(call, short, tmp_path):
 
 def test_learning_for_a_planner_is_the_learning_of_few_shot_adaptation(rough_cartpole):
     target = make_dynamics("cartpole", "push=1")
-    transitions, residual, _ = adaptation.learn(rough_cartpole, target, 40, seed=2)
-    whole = adaptation.adapt(
-        rough_cartpole, target, samples=40, seed=2, config=apg.APGConfig(updates=1, batch=2, episodes=2)
-    )
+    transitions, residual, _ = adaptation.learn(rough_cartpole, target, 40, "acceleration", seed=2)
+    config = apg.APGConfig(updates=1, batch=2, episodes=2)
+    whole = adaptation.adapt(rough_cartpole, target, samples=40, kind="acceleration", seed=2, config=config)
     assert transitions.state.equal(whole.transitions.state)
     assert residual.weights.equal(whole.residual.weights)
 

@@ -217,16 +217,16 @@ def test_thirty_transitions_are_enough_where_the_force_is_linear(name, target, l
 
 
 def test_linear_drag_is_found_by_name_and_number():
-    residual, report = fit_residual(flights("quadrotor", "drag=0.3", 30, steps=30), make_dynamics("quadrotor"))
+    data = flights("quadrotor", "drag=0.3", 30, steps=30)
+    residual, report = fit_residual(data, make_dynamics("quadrotor"), "acceleration")
     torch.testing.assert_close(residual.weights[:3, :3].diagonal(), torch.full((3,), -0.3).double(), rtol=0, atol=1e-3)
     assert [len(report.inputs[row]) for row in ("vx", "vy", "vz", "p", "q", "r")] == [1, 1, 1, 0, 0, 0]
     assert not residual.config.factors
 
 
 def test_quadratic_drag_is_found_as_speed_times_velocity():
-    residual, report = fit_residual(
-        flights("quadrotor", "quadratic_drag=0.1", 30, steps=30), make_dynamics("quadrotor")
-    )
+    data = flights("quadrotor", "quadratic_drag=0.1", 30, steps=30)
+    residual, report = fit_residual(data, make_dynamics("quadrotor"), "acceleration")
     columns = [residual.feature_names().index(report.inputs[row][0]) for row in ("vx", "vy", "vz")]
     width = len(residual.feature_names()) // 2
     assert columns == [width, width + 1, width + 2]
