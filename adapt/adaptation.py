@@ -186,7 +186,7 @@ def adapt(
         raise InputError("adapt: needs a target to fly in, or recorded transitions")
     if target is None and oracle:
         raise InputError("--oracle: needs a target that can be flown in; a log has none")
-    clock = Clock(stage)
+    clock, recorded = Clock(stage), transitions is not None
     task, source = policy.task, Dynamics(policy.task.system)
     seen = seen or task
     device = next(policy.network.parameters()).device
@@ -220,7 +220,8 @@ def adapt(
     notes += [*mends, *check_labels(transitions, source)]
     clock.next("fit")
     residual, fit = residuals.fit_residual(transitions, source, kind, seed)
-    if not fit.solved and len(newest := still_true(transitions, source, seed)) < len(transitions):
+    # Only what was recorded may be of different days; what was flown just now is of one robot.
+    if recorded and not fit.solved and len(newest := still_true(transitions, source, seed)) < len(transitions):
         notes.append(f"older flight contradicts newer: learned from the last {len(newest)} of {len(transitions)} alone")
         transitions = newest
         residual, fit = residuals.fit_residual(transitions, source, kind, seed)

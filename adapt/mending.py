@@ -13,7 +13,9 @@ from adapt.residual import fit_residual
 from adapt.transitions import joined
 from envs.errors import InputError
 
-SHORTEST = 30  # transitions that are left to learn from, at least
+# Transitions that are left to learn from, at least. A robot that sticks now and then, or flies one manoeuvre for long, is
+# predicted best by a fit to that alone, so fewer would tell of changes where there are none.
+SHORTEST = 60
 SMALLEST = 16  # the newest flight that is asked is no smaller a part than one of so many
 QUICK = "linear"  # kind of residual that tells whether flights are of one robot
 CONTRADICTS = 2.0  # times the error that newer flight leaves of itself, beyond which older flight is another robot's

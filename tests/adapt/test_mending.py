@@ -67,12 +67,12 @@ def test_flight_from_before_a_change_is_left_out(noise, before, left):
 
 
 def test_a_change_late_in_the_record_is_found():
-    both = joined((flown("mass=x1.3", 250, seed=1), flown("drag=0.3", 50, seed=2)))
+    both = joined((flown("mass=x1.3", 400, seed=1), flown("drag=0.3", 100, seed=2)))
     kept = still_true(both, Dynamics(load_policy("quadrotor").task.system))
-    assert len(kept) == 37  # of the 50: the newest eighth
-    assert torch.equal(kept.state, both.state[-37:])
+    assert len(kept) == 62  # of the 100: the newest eighth
+    assert torch.equal(kept.state, both.state[-62:])
 
 
 def test_little_flight_is_kept_whatever_it_says(data):
-    few = joined((flown("mass=x1.3", 20, 1), flown("drag=0.3", 20, 2)))
+    few = joined((flown("mass=x1.3", 50, 1), flown("drag=0.3", 50, 2)))
     assert still_true(few, Dynamics(load_policy("quadrotor").task.system)) is few
