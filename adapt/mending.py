@@ -13,7 +13,7 @@ from adapt.residual import fit_residual
 from adapt.transitions import joined
 from envs.errors import InputError
 
-# Transitions that are left to learn from, at least. A robot that sticks now and then, or flies one manoeuvre for long, is
+# Transitions that are left to learn from, at least. A robot that sticks now and then, or flies a manoeuvre for long, is
 # predicted best by a fit to that alone, so fewer would tell of changes where there are none.
 SHORTEST = 60
 SMALLEST = 16  # the newest flight that is asked is no smaller a part than one of so many
