@@ -201,10 +201,10 @@ def adapt(
             most = PICTURE_ROUNDS if METHODS[policy.method].pixels else 1
             most = PARTS if until_known else most
             rounds = rounds or min(most, max(1, samples // residuals.MINIMUM))
-            settings = {"kind": kind, "config": config or finetuning(policy), "progress": progress}
-            settings["until_known"] = until_known
+            settings = {"kind": kind, "config": config or finetuning(policy), "until_known": until_known}
+            settings |= {"progress": progress, "keep": keep}
             begun, transitions, footage = _collected(
-                policy, target, seen, samples, rounds, exploration, seed, device, keep, **settings
+                policy, target, seen, samples, rounds, exploration, seed, device, **settings
             )
             if until_known and len(transitions) < samples:
                 notes.append(
@@ -259,7 +259,7 @@ def adapt(
     evaluations["few_shot"] = evaluations["zero_shot"]
     if chosen is not policy:
         evaluations["few_shot"] = evaluate(chosen.actor(seed), truth, seen, tests)
-    if chosen is policy and plant is None and not same_weights(policy, tuned):  # no plant is risked for it
+    if chosen is policy and verdict is not UNCHANGED and plant is None:  # no plant is risked for it
         evaluations["refused"] = evaluate(tuned.actor(seed), truth, seen, tests)
     best = None
     if oracle:
@@ -297,7 +297,7 @@ def _held_out(actor, target, task, episodes, seed, device):
 
 
 def _collected(
-    policy, target, task, samples, rounds, exploration, seed, device, keep, *, kind, config, progress, until_known
+    policy, target, task, samples, rounds, exploration, seed, device, *, kind, config, until_known, progress, keep
 ):
     """Fly, fit, tune, fly: the policy of the last round, all transitions, and all footage if it sees pictures.
 

@@ -15,6 +15,7 @@ import tyro
 
 from adapt import command
 from envs.errors import InputError
+from policies.files import read_text_table, replacing
 
 Repeatable = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 TABLE, PICTURE = "audit.csv", "audit.png"
@@ -147,17 +148,8 @@ def read(folder):
     Raises:
         InputError: not a table of this command.
     """
-    import pandas as pd
-
     path = Path(folder) / TABLE
-    if not path.is_file():
-        return pd.DataFrame(columns=list(COLUMNS), dtype=str)
-    try:
-        table = pd.read_csv(path, dtype=str, keep_default_na=False)
-    except (ValueError, OSError) as error:
-        raise InputError(f"{path}: can't be read ({str(error).splitlines()[0]})") from None
-    if missing := [column for column in COLUMNS if column not in table]:
-        raise InputError(f"{path}: has no column {missing[0]}; expected what adapt.audit writes")
+    table = read_text_table(path, COLUMNS, "adapt.audit")
     if not table["index"].str.isdecimal().all():
         raise InputError(f"{path}: an index is no number; expected what adapt.audit writes")
     return table[list(COLUMNS)]
@@ -167,8 +159,6 @@ def add(folder, row):
     """Put a row into the table of a folder, in place of one of the same case."""
     import pandas as pd
     from filelock import FileLock
-
-    from policies.files import replacing
 
     text = {column: "" if (value := row.get(column)) is None else str(value) for column in COLUMNS}
     with FileLock(Path(folder) / ".lock"):  # other audits may add to the same table

@@ -6,7 +6,7 @@ from adapt import command
 from adapt.experiment_run import CURVE, VERSIONS, config_hash, curve, finished
 from adapt.experiment_table import EXPERIMENTS
 from envs.errors import InputError
-from policies.files import replacing
+from policies.files import read_text_table, replacing
 
 FIGURES = ("error", "std", "success", "n", "source", "zero_shot", "oracle")
 FIGURES += (
@@ -34,14 +34,7 @@ def read(folder, name="experiments.csv", columns=COLUMNS):
     import pandas as pd
 
     path = Path(folder) / name
-    if not path.is_file():
-        return pd.DataFrame(columns=list(columns), dtype=str)
-    try:
-        table = pd.read_csv(path, dtype=str, keep_default_na=False)
-    except (ValueError, OSError) as error:
-        raise InputError(f"{path}: can't be read ({str(error).splitlines()[0]})") from None
-    if missing := [column for column in columns if column not in table]:
-        raise InputError(f"{path}: has no column {missing[0]}; expected what adapt.experiments writes")
+    table = read_text_table(path, columns, "adapt.experiments")
     numbers = pd.to_numeric(table.seed, errors="coerce")
     if (wrong := numbers.isna() | (numbers < 0) | (numbers % 1 != 0)).any():
         line = int(wrong.to_numpy().argmax()) + 2

@@ -69,8 +69,7 @@ def _gain(base, recorded, other):
 
 
 def _missed(base, data):
-    system = base.system
-    states = [getattr(data, name).double() for name in ("state", "action", "next_state")]
-    missed = difference(system, base(*states[:2]), states[2])
+    system, data = base.system, data.double()
+    missed = difference(system, base(data.state, data.action), data.next_state)
     rows = [i for i, quantity in enumerate(system.quantities) if quantity in QUANTITIES] or slice(None)
     return missed[:, rows].std(0, correction=0) + MISSED  # the mean is left to wind and drag

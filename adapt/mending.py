@@ -4,8 +4,6 @@ What is recorded goes through many hands. A fit is sure of itself where rows are
 are shuffled; and flight from before a change of the robot contradicts what came after it.
 """
 
-from dataclasses import replace
-
 import torch
 
 from adapt.choose_residual import MOTION, HeldOut
@@ -86,17 +84,10 @@ def _contradict(older, newer, base, seed):
     parts = [newer.select(slice(0, cut)), newer.select(slice(cut, None))]
     errors = []
     for learned, held in (parts, parts[::-1]):
-        flown = HeldOut(base, _double(held))
-        learned = (joined((older, learned)), learned)
-        fits = [fit_residual(data, base, QUICK, seed)[0] for data in learned]
+        flown = HeldOut(base, held.double())
+        fits = [fit_residual(data, base, QUICK, seed)[0] for data in (joined((older, learned)), learned)]
         found = [flown.missed(residual).square().mean((0, 1)) for residual in fits]
         errors.append(torch.stack([*found, flown.moved.mean(0)]))
     by_all, by_newer, moved = torch.stack(errors).mean(0)
     units = torch.maximum(by_newer, MOTION**2 * moved).clamp(min=1e-18)
     return float((by_all / units).mean().sqrt()) > CONTRADICTS
-
-
-def _double(data):
-    context = None if data.context is None else data.context.double()
-    parts = {name: getattr(data, name).double() for name in ("state", "action", "next_state")}
-    return replace(data, **parts, context=context)

@@ -109,7 +109,7 @@ def fit_residual(transitions, base, kind=AUTO, seed=0, settings=FitSettings(), p
     began = time.perf_counter()
     check(transitions, base.system, MINIMUM)
     generator = torch.Generator().manual_seed(seed)
-    data = _in_double(transitions)
+    data = transitions.double()
     if kind == AUTO:
         return _chosen(data, base, seed, settings, began)
     chosen = _kind(kind, parameters)
@@ -183,12 +183,6 @@ def _shape(kind, settings, contexts, parameters):
         return ResidualConfig("parameters", 0, parameters=tuple(parameters), factors=())
     hidden = (FEATURES if kind.network == "cos" else settings.hidden) if settings.network else 0
     return ResidualConfig(kind.form, hidden, kind.network or "tanh", contexts, (SPEED, *contexts))
-
-
-def _in_double(transitions):
-    parts = {name: getattr(transitions, name).double() for name in ("state", "action", "next_state")}
-    context = None if transitions.context is None else transitions.context.double()
-    return replace(transitions, **parts, context=context)
 
 
 def _check_prediction(base, data):

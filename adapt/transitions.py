@@ -65,6 +65,12 @@ class Transitions:
         parts = {name: getattr(self, name)[rows] for name in ("state", "action", "next_state", "trajectory")}
         return replace(self, **parts, context=context)
 
+    def double(self):
+        """The same in double precision."""
+        context = None if self.context is None else self.context.double()
+        parts = {name: getattr(self, name).double() for name in ("state", "action", "next_state")}
+        return replace(self, **parts, context=context)
+
     def split(self, fraction, generator):
         """Two parts, the first with about `fraction` of the trajectories drawn at random, never less than one in each.
 

@@ -34,6 +34,25 @@ def replacing(path):
         raise InputError(f"{path}: can't write ({error.strerror or error}); name a writable place") from error
 
 
+def read_text_table(path, columns, writer):
+    """A CSV as text, so that what is written again is what was read; empty, with these columns, where there is no file.
+
+    Raises:
+        InputError: what can't be read, or lacks a column of what `writer` writes.
+    """
+    import pandas as pd
+
+    if not path.is_file():
+        return pd.DataFrame(columns=list(columns), dtype=str)
+    try:
+        table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    except (ValueError, OSError) as error:
+        raise InputError(f"{path}: can't be read ({str(error).splitlines()[0]})") from None
+    if missing := [column for column in columns if column not in table]:
+        raise InputError(f"{path}: has no column {missing[0]}; expected what {writer} writes")
+    return table
+
+
 def read_safetensors(path, expected, entry):
     """Tensors and the JSON `entry` of the header of a safetensors file of the `expected` format; never runs code.
 

@@ -31,7 +31,7 @@ def tried(kind, *shares):
 def test_the_model_leaves_everything_and_the_truth_nothing(data):
     base, truth = make_dynamics("quadrotor"), make_dynamics("quadrotor", TARGET)
     half = make_dynamics("quadrotor", "drag=0.15")
-    held = HeldOut(base, fit_double(data))
+    held = HeldOut(base, data.double())
     everything, nothing, a_quarter = (held.share(held.missed(one)) for one in (base, truth, half))
     # states that a drag doesn't change, attitude and rates, count nothing and leave a half
     assert everything == pytest.approx(0.5)
@@ -41,7 +41,7 @@ def test_the_model_leaves_everything_and_the_truth_nothing(data):
 
 def test_what_predicts_the_next_measurement_by_filtering_noise_is_no_better_than_the_truth(data):
     """Under noise a yaw rate seems to decay faster than it does: a gain that isn't there predicts it."""
-    seen, base = measured(fit_double(data)), make_dynamics("quadrotor")
+    seen, base = measured(data.double()), make_dynamics("quadrotor")
     filtering, truth = (make_dynamics("quadrotor", target) for target in (f"{TARGET} rate_gain_z=8", TARGET))
     assert prediction_error(filtering, seen)["rates"] < prediction_error(truth, seen)["rates"]
     held = HeldOut(base, seen)
@@ -52,7 +52,7 @@ def test_what_predicts_the_next_measurement_by_filtering_noise_is_no_better_than
 
 def test_another_beginning_explains_what_it_leads_to_and_no_push(data):
     base, pushed = make_dynamics("quadrotor", TARGET), make_dynamics("quadrotor", f"{TARGET} push=0.5")
-    held = HeldOut(base, fit_double(data))
+    held = HeldOut(base, data.double())
     shift = 1e-3 * torch.randn(12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     begun_elsewhere, unit = held.of_start @ shift, torch.ones(12, dtype=torch.float64)
     assert held.unexplained(begun_elsewhere, unit).max() < 1e-12
@@ -69,12 +69,6 @@ def measured(data):
         displaced(system, part, error) for part, error in ((data.state, errors[:-1]), (data.next_state, errors[1:]))
     ]
     return replace(data, state=states[0], next_state=states[1])
-
-
-def fit_double(data):
-    from adapt.residual import _in_double
-
-    return _in_double(data)
 
 
 def test_of_equals_the_simplest_is_taken():
@@ -99,7 +93,7 @@ def test_where_no_kind_can_be_fitted_that_is_said(data):
         raise InputError("too few")
 
     with pytest.raises(InputError, match="no kind of residual can be fitted; a: too few"):
-        choose(fit_double(data), make_dynamics("quadrotor"), ("a", "b"), fit)
+        choose(data.double(), make_dynamics("quadrotor"), ("a", "b"), fit)
 
 
 def test_nothing_more_complex_is_tried_once_nothing_is_left(data):
@@ -109,7 +103,7 @@ def test_nothing_more_complex_is_tried_once_nothing_is_left(data):
         asked.append((kind, len(part)))
         return make_dynamics("quadrotor", {"poor": "drag=0.1", "perfect": TARGET, "never": TARGET}[kind])
 
-    found, kind, solved = choose(fit_double(data), make_dynamics("quadrotor"), ("poor", "perfect", "never"), fit)
+    found, kind, solved = choose(data.double(), make_dynamics("quadrotor"), ("poor", "perfect", "never"), fit)
     assert kind == "perfect"
     assert solved
     assert [one.kind for one in found] == ["poor", "perfect"]
@@ -123,7 +117,7 @@ def test_a_kind_that_there_are_too_few_transitions_for_is_dropped(data):
             raise InputError("too few transitions")
         return make_dynamics("quadrotor", "drag=0.1")
 
-    found, kind, solved = choose(fit_double(data), make_dynamics("quadrotor"), ("hungry", "modest"), fit)
+    found, kind, solved = choose(data.double(), make_dynamics("quadrotor"), ("hungry", "modest"), fit)
     assert not solved
     assert kind == "modest" and found[0].why == "too few transitions"
 
