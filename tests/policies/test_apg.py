@@ -387,9 +387,9 @@ def test_the_papers_own_settings_run(name):
     paper = apg.PRESETS["paper"]
     config = replace(paper, updates=6, episodes=6)
     run, history = finished(name, config)
-    assert (paper.optimizer, paper.learning_rate, paper.batch, paper.width) == ("sgd", 1e-5, 8, None)
+    assert (paper.optimizer, paper.learning_rate, paper.batch, paper.width) == ("sgd", 8e-5, 8, None)
     assert run.optimizer.param_groups[0]["momentum"] == 0.9
-    assert run.optimizer.param_groups[0]["lr"] == pytest.approx(1e-5)  # constant
+    assert run.optimizer.param_groups[0]["lr"] == pytest.approx(8e-5)  # constant
     assert len(history) == 6
     assert run.skipped == 0
 
