@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from adapt import evidence, table_cells
+from adapt import evidence, table_cells, target_tables
 from adapt.experiment_table import EXPERIMENTS
 from adapt.table_layouts import LAYOUTS
 
@@ -164,3 +164,39 @@ def test_every_experiment_for_a_table_has_a_cell_in_it():
         found = known(*((name, (1000.0 + number,)) for number, name in enumerate(names)))
         text = str(layout(found).rows)
         assert [name for number, name in enumerate(names) if f"{1000.0 + number:.2f}" not in text] == []
+
+
+KINDS = ("parameters", "linear", "features", "network", "linear+network", "state")
+
+
+def of_kinds(auto, **errors):
+    """Evidence of all kinds in the quadrotor's drag: 0.05 with three seeds but where said otherwise, and of auto."""
+    tried = ((f"kinds-drag-quadrotor-{kind}", errors.get(kind, (0.05, 0.05, 0.05))) for kind in KINDS)
+    return known(*tried, ("target-drag-quadrotor-300", auto))
+
+
+def test_regret_is_told_over_the_seeds_that_all_kinds_were_run_with():
+    found = of_kinds((0.02, 0.03, 0.04, 9.0, 9.0), network=(0.01, 0.02, 0.03, 5.0))
+    row = cells(found, "kinds", "quadrotor [m], drag 0.3")
+    assert (row["auto"], row["network"], row["state"]) == ("0.0300", "0.0200", "0.0500")
+    assert (row["regret"], row["seeds"]) == ("+50 %", "3")
+
+
+def test_auto_may_be_better_than_every_kind():
+    assert cells(of_kinds((0.04, 0.04, 0.04)), "kinds", "quadrotor [m], drag 0.3")["regret"] == "-20 %"
+
+
+def test_a_kind_that_fails_is_no_rival_in_hindsight():
+    found = of_kinds((0.06, 0.06, 0.06), linear=(math.nan, 0.001, 0.001))
+    assert cells(found, "kinds", "quadrotor [m], drag 0.3")["regret"] == "+20 %"
+
+
+def test_no_regret_is_told_before_all_kinds_and_auto_are_run():
+    found = known(*((f"kinds-drag-quadrotor-{kind}", (0.05,)) for kind in KINDS))
+    row = cells(found, "kinds", "quadrotor [m], drag 0.3")
+    assert (row["state"], row["auto"], row["regret"], row["seeds"]) == ("0.0500", "–", "–", "1")
+
+
+def test_the_gap_closed_is_the_mean_over_seeds_that_had_one_to_close():
+    rows = pd.DataFrame({"zero_shot": [0.10, 0.10, 0.02], "oracle": [0.02, 0.02, 0.03], "error": [0.02, 0.06, 0.5]})
+    assert target_tables.gap_closed(rows, "oracle") == "0.75 (0.50)"
