@@ -23,6 +23,7 @@ from policies.files import whole
 DPI = 150
 GREY, LIGHT = "#595959", "#BDBDBD"
 COLOURS = {"source": GREY, "zero_shot": "#D55E00", "few_shot": "#0072B2", "oracle": "#009E73"}
+LINES = {"source": "--", "oracle": (0, (2, 2))}  # what lies below the oracle's line, as few-shot should, is seen
 STYLE = {
     "font.size": 13,
     "axes.titlesize": 14,
@@ -111,6 +112,12 @@ def score(evaluation, scale):
     return f"{number(factor * mean)} {unit}" + (f", {failed} of {flights} fail" if failed else "")
 
 
+def _say_score(axes, name, evaluation, scale, side):
+    """The same as a title, in its colour; failed flights in a line of their own, so that two titles have room."""
+    said = f"{NAMES[name]}: {score(evaluation, scale)}".replace(", ", ",\n")
+    axes.set_title(said, loc=side, color=COLOURS[name], fontweight="bold")
+
+
 def score_scale(adaptation):
     """The scale in which all scores are told."""
     means = [evaluation.summary["mean"] for evaluation in adaptation.evaluations.values()]
@@ -168,8 +175,7 @@ def draw_flight(adaptation):
             axes.set_xlabel(label(axis_of(task.system, view[0])))
         grid[i, 0].set_ylabel(label(axis_of(task.system, view[1])))
     for axes, name, evaluation in zip(grid[0], names, evaluations, strict=True):
-        title = f"{NAMES[name]}: {score(evaluation, score_scale(adaptation))}"
-        axes.set_title(title, color=COLOURS[name], fontweight="bold")
+        _say_score(axes, name, evaluation, score_scale(adaptation), "center")
     bar = figure.colorbar(lines, ax=grid, aspect=30, pad=0.02, extend="max", ticks=MaxNLocator(5))
     bar.set_label(f"{task.trace_name} [{unit}]")
     bar.outline.set_visible(False)
@@ -233,9 +239,8 @@ def draw_error(adaptation):
     for name, trace in found.items():
         flying = _flying(trace)
         time, error = task.system.dt * np.arange(trace.shape[1])[flying], factor * trace[:, flying]
-        style = "--" if name == "source" else "-"
         said = f"{NAMES[name]}: {score(evaluations[name], score_scale(adaptation))}"
-        axes.plot(time, np.nanmean(error, 0), style, color=COLOURS[name], label=said)
+        axes.plot(time, np.nanmean(error, 0), linestyle=LINES.get(name, "-"), color=COLOURS[name], label=said)
         if flying.any():
             low, high = np.nanquantile(error, (0.1, 0.9), axis=0)
             axes.fill_between(time, low, high, color=COLOURS[name], alpha=0.15, linewidth=0)
@@ -350,22 +355,28 @@ def draw_training(adaptation):
     figure = Figure(figsize=(7, 4.8), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(2.6, 1))
     colour = COLOURS["few_shot"]
-    for axes, values in ((top, cost), (bottom, norm)):
+    for axes, values, room in ((top, cost, 7), (bottom, norm, 3)):
         axes.plot(update, values, color=colour, alpha=0.35, linewidth=1.5, label="each update")
         axes.plot(update, smoothed(values), color=colour, label="smoothed")
-        axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=6))
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_formatter(NullFormatter())
+        _log_scale(axes, values, room)
     top.set_ylabel("cost [-]")
     top.legend(loc="best")
     bottom.set_ylabel("gradient\nnorm [-]")
     bottom.set_xlabel("update of the fine-tuning in model + residual")
     for name, side in (("zero_shot", "left"), ("few_shot", "right")):
-        said = f"{NAMES[name]}: {score(evaluations[name], scale)}"
-        top.set_title(said, loc=side, color=COLOURS[name], fontweight="bold")
+        _say_score(top, name, evaluations[name], scale, side)
     figure.align_ylabels()
     return figure
+
+
+def _log_scale(axes, values, room):
+    """A logarithmic scale with plain numbers, about as many as there is room for."""
+    known = values[np.isfinite(values) & (values > 0)]
+    decades = np.log10(known.max() / known.min()) if len(known) else 0.0
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if 3 * decades <= room else (1,), numticks=room))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def smoothed(values):

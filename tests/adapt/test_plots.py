@@ -107,6 +107,24 @@ def test_an_oracle_and_flights_that_all_fail_can_be_drawn(quadrotor):
     assert any(text.startswith("oracle: ") for text in said)
 
 
+def test_titles_of_flights_that_fail_in_part_do_not_run_into_each_other(quadrotor):
+    some = with_table(quadrotor, "zero_shot", success=[True, True, False, True, True])
+    some = with_table(some, "few_shot", success=[True, True, False, True, True])
+    figure = plots.draw_training(some)
+    figure.draw_without_rendering()
+    left, right = (getattr(figure.axes[0], name).get_window_extent() for name in ("_left_title", "_right_title"))
+    assert "1 of 5 fail" in figure.axes[0].get_title("left")
+    assert left.x1 < right.x0
+
+
+@pytest.mark.parametrize("decades", [0.3, 1, 2, 5, 9])
+def test_numbers_along_a_logarithmic_axis_have_room(quadrotor, decades):
+    steps = [row | {"gradient_norm": 10 ** (decades * i)} for i, row in enumerate(quadrotor.history[:2])]
+    axes = plots.draw_training(replace(quadrotor, history=steps)).axes[1]
+    low, high = axes.get_ylim()
+    assert 1 <= sum(low <= tick <= high for tick in axes.get_yticks()) <= 5
+
+
 def test_a_picture_that_could_not_be_saved_leaves_nothing_behind(quadrotor, tmp_path, monkeypatch):
     def broken(figure, path, **options):
         path.write_bytes(b"half of a picture")
