@@ -7,6 +7,7 @@ from functools import cache
 import cv2
 import matplotlib
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from matplotlib.figure import Figure
@@ -108,12 +109,14 @@ def test_an_oracle_and_flights_that_all_fail_can_be_drawn(quadrotor):
 
 
 def test_titles_of_flights_that_fail_in_part_do_not_run_into_each_other(quadrotor):
-    some = with_table(quadrotor, "zero_shot", success=[True, True, False, True, True])
-    some = with_table(some, "few_shot", success=[True, True, False, True, True])
-    figure = plots.draw_training(some)
-    figure.draw_without_rendering()
+    table = pd.DataFrame({"error": 0.76, "success": [True] * 14 + [False] * 16})
+    evaluations = {name: replace(one, table=table) for name, one in quadrotor.evaluations.items()}
+    some = replace(quadrotor, evaluations=evaluations)
+    with matplotlib.rc_context(plots.STYLE):
+        figure = plots.draw_training(some)
+        figure.draw_without_rendering()
     left, right = (getattr(figure.axes[0], name).get_window_extent() for name in ("_left_title", "_right_title"))
-    assert "1 of 5 fail" in figure.axes[0].get_title("left")
+    assert "16 of 30 fail" in figure.axes[0].get_title("left")
     assert left.x1 < right.x0
 
 
