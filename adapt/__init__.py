@@ -13,7 +13,7 @@ _HOMES = {
     "load_residual": "residual_kinds",
     "prediction_error": "prediction",
     "adapt": "adaptation",
-    "finetune": "adaptation",
+    "finetune": "finetuning",
 }
 __all__ = sorted(_HOMES)
 

@@ -110,7 +110,7 @@ def _settings(step):
     Options that are off don't count, so that a new one of a command changes no hash.
     """
     from adapt import pretrain
-    from adapt.adaptation import usual_finetuning
+    from adapt.finetuning import usual_finetuning
     from envs import make_system, make_task
     from envs.camera import Camera
     from policies import METHODS, pixel_mpc

@@ -171,7 +171,8 @@ def _adapt(options, setting, policy, recorded, folder, device):
 
     from tqdm import tqdm
 
-    from adapt.adaptation import adapt, finetuning
+    from adapt.adaptation import adapt
+    from adapt.finetuning import finetuning
     from policies.checkpoints import save_policy
 
     settings = {"options": asdict(options), **command.environment(options.seed, options.threads)}
@@ -219,7 +220,7 @@ def _adapt(options, setting, policy, recorded, folder, device):
 
 
 def _updates(options, policy):
-    from adapt.adaptation import finetuning
+    from adapt.finetuning import finetuning
 
     return options.updates or finetuning(policy).updates
 

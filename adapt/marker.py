@@ -156,7 +156,7 @@ def contexts(recording, masses):
 
 def experiment(options, policy):
     """Record, fit the residuals, measure them, fine-tune in them; the metrics and a picture (3, h, w) of each pole."""
-    from adapt.adaptation import Clock
+    from adapt.clock import Clock
     from adapt.residual import fit_residual
     from envs.dynamics import Dynamics
 
@@ -164,7 +164,7 @@ def experiment(options, policy):
     masses = (options.light, options.heavy)
     targets = [mounted(task, mass, colour) for mass, colour in zip(masses, TIPS.values(), strict=True)]
     clock.next("collect")
-    # As in adapt.adaptation: training episodes that the pretraining did not see.
+    # As in adapt.rounds: training episodes that the pretraining did not see.
     flown = record(policy, targets, options.samples, "train", 1_000_000 + seed, options.exploration)
     unseen = record(policy, targets, UNSEEN, "validation", seed, options.exploration)
     clock.next("fit")
@@ -228,7 +228,7 @@ def one_step(dynamics, held_out, pole):
 
 def closed_loop(options, policy, targets, dynamics, seen):
     """Test flights with each pole of the policy as it is, tuned without context, and tuned for what is seen."""
-    from adapt.adaptation import finetune, finetuning
+    from adapt.finetuning import finetune, finetuning
     from policies.evaluate import evaluate, test_episodes
 
     tests = test_episodes(policy.task)

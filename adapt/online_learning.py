@@ -9,8 +9,8 @@ from functools import lru_cache
 import torch
 from torch.optim.swa_utils import AveragedModel
 
-from adapt.adaptation import finetuning
 from adapt.bootstrap import fit_ensemble
+from adapt.finetuning import finetuning
 from adapt.gate import Gate, Verdict
 from adapt.online_window import likelihood
 from adapt.residual import fit_residual

@@ -6,8 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from adapt import adaptation
-from adapt.adaptation import Clock, adapt, finetune
+from adapt import finetuning, rounds
+from adapt.adaptation import adapt
+from adapt.clock import Clock
+from adapt.finetuning import finetune
 from adapt.flying import collect
 from adapt.residual import MINIMUM
 from adapt.transitions import Transitions, joined
@@ -263,13 +265,13 @@ def test_a_quadrotor_learns_a_drag_from_ten_seconds_of_flight(rough_quadrotor):
 
 def test_in_rounds_each_part_is_flown_by_the_policy_tuned_on_those_before(rough_cartpole, target, monkeypatch):
     flown = []
-    whole = adaptation._flown
+    whole = rounds.fly
 
     def noted(policy, *rest):
         flown.append(policy)
         return whole(policy, *rest)
 
-    monkeypatch.setattr(adaptation, "_flown", noted)
+    monkeypatch.setattr(rounds, "fly", noted)
     result = adapt(rough_cartpole, target, samples=100, rounds=3, config=replace(QUICK, updates=3))
     assert flown[0] is rough_cartpole
     assert len({id(policy) for policy in flown}) == 3
@@ -278,11 +280,11 @@ def test_in_rounds_each_part_is_flown_by_the_policy_tuned_on_those_before(rough_
 
 
 def test_to_watch_flies_validation_episodes_in_the_target(rough_cartpole, target):
-    judge = adaptation.Judge(rough_cartpole, target, rough_cartpole.task, every=5, last=11, episodes=4)
+    judge = finetuning.Judge(rough_cartpole, target, rough_cartpole.task, every=5, last=11, episodes=4)
     assert judge(rough_cartpole.network, 4) == {} and judge.seconds == 0
     assert set(judge(rough_cartpole.network, 11)) == {"error", "success"} and judge.seconds > 0
     unseen = rough_cartpole.task.episodes(4, "validation", 0)
-    found = adaptation.evaluate(as_actor(rough_cartpole.network), target, rough_cartpole.task, unseen).summary
+    found = finetuning.evaluate(as_actor(rough_cartpole.network), target, rough_cartpole.task, unseen).summary
     assert judge(rough_cartpole.network, 10) == {"error": found["mean"], "success": found["success"]}
 
 

@@ -396,7 +396,7 @@ def ctrl_c(*args, **kwargs):
 @pytest.mark.parametrize(
     ("place", "left"),
     [
-        ("adapt.adaptation.collect", {"config.json"}),
+        ("adapt.rounds.collect", {"config.json"}),
         ("adapt.residual.fit_residual", {"config.json", "transitions.csv"}),
         ("policies.apg.learning_rate", {"config.json", "transitions.csv", "residual.safetensors"}),
         ("adapt.fewshot._metrics", FILES - {"metrics.json"}),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from adapt import adapt, adaptation
-from adapt.adaptation import finetune, finetuning
+from adapt.finetuning import finetune, finetuning
 from adapt.flying import film_transitions, filmed
 from envs import InputError, make_dynamics, make_task, parse_target
 from envs.camera import Camera

@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from adapt import plots, video
-from adapt.adaptation import Adaptation, finetune
+from adapt.adaptation import Adaptation
+from adapt.finetuning import finetune
 from adapt.flying import collect
 from adapt.prediction import prediction_error
 from adapt.residual import FitSettings, fit_residual

@@ -12,7 +12,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import InitTracker
 from torchrl.envs.utils import step_mdp
 
-from adapt.adaptation import finetune
+from adapt.finetuning import finetune
 from adapt.flying import collect
 from envs import SYSTEMS, make_dynamics, make_task
 from envs.env import TrackingEnv
