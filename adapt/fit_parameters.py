@@ -206,8 +206,19 @@ def settle(loss, names, start):
         values = {name: values[name] + float(c * s) for name, c, s in zip(names, change, sizes, strict=True)}
         if change.abs().max() < SETTLED:
             break
+    if not _physical(loss.base, values):  # the last step led there
+        return None
     noise = () if loss.noise is None else tuple(loss.noise.tolist())
     return Found(values, dict(zip(names, errors.tolist(), strict=True)), noise=noise)
+
+
+def _physical(base, values):
+    """Whether a robot can have these values."""
+    try:
+        changed(base, values)
+    except InputError:
+        return False
+    return True
 
 
 def _standard_errors(left, effects):
