@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from adapt import collect, report
+from adapt import collect, fit_parameters, report
 from adapt.fit_parameters import search, undetermined
 from adapt.parameter_losses import OneStep, Shooting
 from adapt.parameter_residual import changed, own_parameters
@@ -211,8 +211,6 @@ def test_stretches_that_nothing_can_be_predicted_from_are_refused():
 
 def test_where_all_data_together_run_away_what_was_found_without_some_stays(monkeypatch):
     """Held-out flight may contradict the rest, so that no values explain both."""
-    from adapt import fit_parameters
-
     data, whole = flown("quadrotor", "drag=0.3", 60), fit_parameters.settle
     monkeypatch.setattr(
         fit_parameters, "settle", lambda loss, *rest: None if len(loss.data) == len(data) else whole(loss, *rest)
@@ -285,3 +283,23 @@ def test_the_fit_returns_a_residual_that_predicts(tmp_path):
 def test_wrong_parameters_are_refused(kind, parameters, words):
     with pytest.raises(InputError, match=words):
         fit_residual(flown("quadrotor", "", 20), make_dynamics("quadrotor"), kind, parameters=parameters)
+
+
+class Drifting:
+    """A loss that asks, wherever it is, for the same step of a parameter once more."""
+
+    noise = None
+
+    def __init__(self, base, step):
+        self.base, self.step = base, step
+
+    def linearised(self, values, names):
+        changed(self.base, values)
+        return torch.full((2,), self.step, dtype=torch.float64), torch.ones(2, len(names), dtype=torch.float64)
+
+
+@pytest.mark.parametrize(("step", "found"), [(-0.12, True), (-0.13, False), (-0.4, False), (0.13, True)])
+def test_values_that_no_robot_can_have_are_none_in_whichever_step_they_are_reached(step, found):
+    base = Dynamics(make_system("cartpole"))
+    assert 8 * -0.12 > -1 > 8 * -0.13  # of a mass, in its size: the last of eight steps makes it negative
+    assert (fit_parameters.settle(Drifting(base, step), ("cart_mass",), {}) is not None) == found
