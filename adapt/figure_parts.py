@@ -16,6 +16,7 @@ BUILD_LOOK = {"compiled": (BLUE, "-"), "eager": (ORANGE, "--")}
 SYSTEM_LOOK = {"quadrotor": (BLUE, "o"), "fixed_wing": (ORANGE, "s")}
 NOTHING = {"low": np.nan, "mean": np.nan, "high": np.nan}
 MOST = 0.9  # share of flights
+MANY = 1e6  # that an axis reaches over from its least to its greatest value
 FAILING_LOOK = {"linestyle": "none", "marker": "o", "markersize": 7, "markerfacecolor": "white", "markeredgewidth": 2}
 PAPER_KEY = {"linestyle": ":", "marker": "o", "markersize": 8, "markerfacecolor": "white", "linewidth": 1.6}
 
@@ -27,7 +28,7 @@ def panels(count, size, **settings):
 
 
 def logarithmic(axis, plain=True):
-    """Make an axis logarithmic and label it at 1 and 3 of each decade, with plain numbers or 10k, 3M.
+    """Make an axis logarithmic and label it at 1 and, of few decades, 3 of each, with plain numbers or 10k, 3M.
 
     To be called when all is drawn; an axis without a number on it has no scale and no ticks.
     """
@@ -35,7 +36,8 @@ def logarithmic(axis, plain=True):
         axis.set_ticks([])
         return
     axis.axes.set(**{f"{axis.axis_name}scale": "log"})
-    axis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1.0, 3.0) if high / low < MANY else (1.0,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}") if plain else EngFormatter(sep=""))
     axis.set_minor_formatter(NullFormatter())
 

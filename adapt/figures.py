@@ -25,6 +25,7 @@ from adapt.figure_parts import (
     METHOD_LOOK,
     MODE_LOOK,
     MOST,
+    NOTHING,
     PAPER_KEY,
     SYSTEM_LOOK,
     band,
@@ -45,6 +46,7 @@ TITLES = {"quadrotor": "quadrotor", "fixed_wing": "fixed wing"}
 CURRICULA = {"both": "threshold and speed", "threshold": "threshold only", "speed": "speed only", "none": "none"}
 ZERO = 10  # where no transitions stand on a logarithmic axis that begins at 30
 WATCHED = 1000  # transitions after which the fine-tuning is watched
+EXACT = 1e-6  # [m/s^2] what single precision leaves of nothing
 
 
 @dataclass(frozen=True)
@@ -179,12 +181,13 @@ def draw_adaptation(evidence):
         budgets = _budgets(evidence, "apg", system)
         names = [f"drag-apg-{system}-{budget}" for budget in budgets]
         if budgets:
-            band(left, budgets, [evidence.spread(name, "learned_acceleration") for name in names], look)
+            errors = [evidence.spread(name, "learned_acceleration") for name in names]
+            band(left, budgets, [_not_below(EXACT, one) for one in errors], look)
             rows = evidence.experiments[evidence.experiments.experiment.isin(names)]
             left.axhline(rows.model_acceleration.mean(), color=look[0], linestyle=":", linewidth=2)
         _tuning(right, evidence, system, look[0])
     left.set(title="learning the residual", xlabel="transitions in the target")
-    left.set_ylabel("one-step acceleration error [m/s²]")
+    left.set_ylabel(f"one-step acceleration error [m/s²]\n(drawn at {EXACT:g} where it is less)")
     right.set(title=f"tuning the controller ({WATCHED} transitions)", xlabel="updates")
     right.set_ylabel("error in the target [m]")
     right.plot([], [], ":", color=GREY, linewidth=2, label="model alone, zero-shot")
@@ -194,6 +197,11 @@ def draw_adaptation(evidence):
         logarithmic(axes.yaxis)
     figure.legend(*right.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
+
+
+def _not_below(least, numbers):
+    """The same `Spread`, what is less in it raised to the least."""
+    return numbers._replace(**{key: max(getattr(numbers, key), least) for key in NOTHING})
 
 
 def _tuning(axes, evidence, system, colour):
