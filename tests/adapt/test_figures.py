@@ -165,6 +165,15 @@ def test_the_fine_tuning_is_shown_between_zero_shot_and_the_error_in_the_model()
     assert {0: 0.006, 1: 0.006} in lines(right)
 
 
+def test_a_residual_that_is_exact_stays_in_the_picture():
+    learned = {"model_acceleration": 0.5, "learned_acceleration": 0.0}
+    left, _ = drawn("adaptation", known([("drag-apg-quadrotor-30", (0.02, 0.04), learned)]))
+    assert lines(left)[0] == {30.0: figures.EXACT}
+    low, high = left.get_ylim()
+    assert low < figures.EXACT < 0.5 < high < 10
+    assert len([tick for tick in left.get_yticks() if low <= tick <= high]) <= 8
+
+
 def test_training_is_shown_over_steps_and_over_time():
     steps, seconds = drawn("learning")[:2]
     assert [line for line in lines(steps) if line] == [{1000: 1.0, 2000: 0.1}, {1000: 3.0, 2000: 0.3}]
