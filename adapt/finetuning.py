@@ -19,7 +19,7 @@ def finetuning(policy):
 def usual_finetuning(method, system):
     """The same for what a method, by name, has trained for a system."""
     module = METHODS[method].module
-    return module.finetuning(module.PRESETS.get(system.name, module.Config()))
+    return module.finetuning(module.PRESETS.get(system.name, module.Config()), system)
 
 
 def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None, judge=None, validations=0):

@@ -153,7 +153,7 @@ def configuration(options, system):
         raise InputError(f"--preset {name}: expected one of {', '.join(method.PRESETS)}")
     config = method.PRESETS.get(name, method.Config())
     if options.policy:
-        config = method.finetuning(config)
+        config = method.finetuning(config, system)
     changes = {key: getattr(options, key) for key in SETTINGS if getattr(options, key) is not None}
     known = {item.name for item in fields(config)}
     for key in changes.keys() - known:

@@ -89,7 +89,7 @@ def _called(name):
 PRESETS = {"cartpole": Config()}
 
 
-def finetuning(config):
+def finetuning(config, system):
     """Settings to continue the training of a policy that was trained with `config`.
 
     No smaller learning rate: with a quarter of it the error in a target stayed twice as large after as many updates

@@ -72,7 +72,7 @@ PRESETS = {
 }
 
 
-def finetuning(config):
+def finetuning(config, system):
     """Settings to continue in a target what was trained with `config`: few transitions, all from planned flights."""
     return replace(config, samples=1000, rounds=4, every=1)
 

@@ -106,7 +106,7 @@ PRESETS = {
 }
 
 
-def finetuning(config):
+def finetuning(config, system):
     """Settings to continue in a target what was trained with `config`, on any number of samples.
 
     The policy flies already: it explores less and moves slowly, so that few transitions can't spoil it. Discount and

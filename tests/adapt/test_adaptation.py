@@ -279,6 +279,14 @@ def test_in_rounds_each_part_is_flown_by_the_policy_tuned_on_those_before(rough_
     assert len(result.history) == 3
 
 
+def test_a_pole_that_is_tuned_where_nothing_differs_is_held_as_still_as_before():
+    policy = load_policy("cartpole")
+    source, tests = Dynamics(policy.task.system), policy.task.episodes(30, "validation", 0)
+    tuned, _ = finetune(policy, source)
+    before, after = (evaluate(p.actor(), source, policy.task, tests).summary["mean"] for p in (policy, tuned))
+    assert after < 1.05 * before
+
+
 def test_to_watch_flies_validation_episodes_in_the_target(rough_cartpole, target):
     judge = finetuning.Judge(rough_cartpole, target, rough_cartpole.task, every=5, last=11, episodes=4)
     assert judge(rough_cartpole.network, 4) == {} and judge.seconds == 0

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from envs import SYSTEMS, InputError, make_dynamics, make_env, make_task
+from envs import SYSTEMS, InputError, make_dynamics, make_env, make_system, make_task
 from envs.camera import Camera
 from policies import METHODS, pick_method
 from policies.checkpoints import load_policy, save_policy
@@ -56,7 +56,7 @@ def test_a_trained_method_has_tuned_settings_for_every_robot(trained):
     for config in method.PRESETS.values():
         assert isinstance(config, method.Config)
         assert config.updates >= 1
-        assert isinstance(method.finetuning(config), method.Config)
+        assert all(isinstance(method.finetuning(config, make_system(name)), method.Config) for name in SYSTEMS)
 
 
 @pytest.mark.parametrize("system", sorted(SYSTEMS))

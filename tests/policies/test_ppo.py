@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from envs import SYSTEMS, make_dynamics, make_env, make_task
+from envs import SYSTEMS, make_dynamics, make_env, make_system, make_task
 from envs.errors import InputError
 from policies import ppo, ppo_update
 from policies.actor_critic import ActorCritic, actor_critic_for
@@ -353,7 +353,9 @@ def test_within_seconds_training_makes_the_cost_of_unseen_flights_a_tenth():
 
 @pytest.mark.parametrize("samples", [1, 1000, 1001, 4999])
 def test_no_more_transitions_are_taken_than_the_budget_and_all_are_counted(samples):
-    config = replace(ppo.finetuning(TINY), samples=samples, batch=128, steps=16, least_updates=10, epochs=1)
+    config = replace(
+        ppo.finetuning(TINY, make_system("cartpole")), samples=samples, batch=128, steps=16, least_updates=10, epochs=1
+    )
     task, dynamics, banks = setting("cartpole")
     counting = Counting(dynamics)
     run = ppo.begin(counting, task, banks, config, 0)
@@ -470,7 +472,7 @@ def test_a_resumed_run_ends_bit_for_bit_where_an_uninterrupted_one_does(name, st
 def test_fine_tuning_goes_on_with_a_copy_in_the_same_units():
     run, _ = finished("quadrotor")
     before, unit = weights_of(run).clone(), float(run.network.unit)
-    config = replace(ppo.finetuning(TINY), samples=200)
+    config = replace(ppo.finetuning(TINY, make_system("cartpole")), samples=200)
     tuned, (_, task, banks, _) = begun("quadrotor", config, network=run.network)
     assert torch.equal(weights_of(tuned), before)
     assert float(tuned.network.unit) == unit > 0

@@ -10,7 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from envs import make_dynamics, make_task
+from envs import make_dynamics, make_system, make_task
 from envs.camera import Camera
 from envs.drawing import draw
 from envs.errors import InputError
@@ -357,7 +357,7 @@ def test_the_same_seed_gives_the_same_weights_another_seed_others_and_the_global
 def test_fine_tuning_goes_on_with_a_copy():
     run, _ = finished()
     before = weights_of(run).clone()
-    config = replace(ppo_pixels.finetuning(TINY), samples=100)
+    config = replace(ppo_pixels.finetuning(TINY, make_system("cartpole")), samples=100)
     tuned, (_, task, banks, _) = begun(config, network=run.network)
     assert torch.equal(weights_of(tuned), before)
     list(ppo_pixels.train(tuned, make_dynamics("cartpole", "gravity=x1.2"), task, banks, config))
