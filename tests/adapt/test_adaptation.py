@@ -14,9 +14,12 @@ from adapt.flying import collect
 from adapt.residual import MINIMUM
 from adapt.transitions import Transitions, joined
 from envs import make_dynamics
+from envs.dynamics import Dynamics
 from envs.env import TrackingEnv
 from envs.errors import InputError
 from policies import apg
+from policies.checkpoints import load_policy
+from policies.evaluate import evaluate
 from policies.networks import as_actor
 
 QUICK = replace(apg.FINETUNE, updates=30, batch=64, episodes=100)
