@@ -111,14 +111,14 @@ def _settings(step):
     """
     from adapt import pretrain
     from adapt.finetuning import usual_finetuning
-    from envs import make_system, make_task
+    from envs import make_task
     from envs.camera import Camera
     from policies import METHODS, pixel_mpc
     from policies.evaluate import TEST_EPISODES
 
     given = import_module(step.command).Options(**step.options)
     yield repr(sorted((k, v) for k, v in asdict(given).items() if v is not None and v is not False and v != ()))
-    system = make_system(step.options.get("system", "cartpole"))
+    system = _robot(given)
     yield repr(system)
     yield repr((_asked(make_task(system)), TEST_EPISODES.get(system.name)))
     method = step.options.get("method", "apg") + ("-pixels" if step.options.get("pixels") else "")
@@ -129,6 +129,15 @@ def _settings(step):
     elif step.command == "adapt.vision":
         yield repr(Camera())
         yield repr((METHODS[f"{method}-pixels"].module if method != "mpc" else pixel_mpc).Config())
+
+
+def _robot(options):
+    """The system of a command's options; a simulator brings its own."""
+    from adapt.setting import with_plant
+
+    if getattr(options, "plant", None):
+        options = with_plant(options)
+    return command.pick_robot(getattr(options, "system", "cartpole"), getattr(options, "vehicle", None))[0]
 
 
 def _asked(task):

@@ -144,6 +144,20 @@ def test_the_hash_changes_with_the_task_and_with_the_settings_of_the_fine_tuning
     step_hash.cache_clear()
 
 
+def test_the_hash_of_a_simulator_is_of_the_robot_that_it_is(monkeypatch):
+    from dataclasses import replace
+
+    from policies import apg
+
+    names = ("simulator-rotorpy", "simulator-jsbsim", "simulator-mujoco")
+    before = [config_hash(name) for name in names]
+    monkeypatch.setitem(apg.FINETUNES, "cartpole", replace(apg.FINETUNES["cartpole"], updates=7))
+    step_hash.cache_clear()
+    changed = [config_hash(name) != old for name, old in zip(names, before, strict=True)]
+    step_hash.cache_clear()
+    assert changed == [False, False, True]
+
+
 def test_the_hash_changes_with_the_tuned_settings(monkeypatch):
     from dataclasses import replace
 
