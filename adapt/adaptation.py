@@ -19,6 +19,7 @@ from adapt.plants import flights_of
 from adapt.prediction import prediction_error
 from adapt.residual_dynamics import ResidualDynamics
 from adapt.rounds import check_flown, fly, fly_in_rounds, held_out
+from adapt.sensor_noise import sensor_noise
 from adapt.transitions import Transitions, check
 from adapt.trust_region import same_weights
 from envs.dynamics import Dynamics
@@ -151,7 +152,8 @@ def adapt(
     clock.next("finetune")
     judge = watch and Judge(policy, truth, seen, watch, config.updates)
     validations = VALIDATIONS if gate and not pixels else 0
-    tuned, history = finetune(begun, learned, config, seed, progress, footage, judge, validations)
+    noise = sensor_noise(_bound(residual, context), transitions) if validations else ()
+    tuned, history = finetune(begun, learned, config, seed, progress, footage, judge, validations, noise)
     if judge:
         clock.move("finetune", "watch", judge.seconds)
     chosen, verdict = tuned, None
@@ -160,7 +162,7 @@ def adapt(
         chosen, verdict = policy, UNCHANGED
         if not same_weights(policy, tuned):
             models = {"the fit": learned} | _alternatives(policy, transitions, source, fit, context, seed, device)
-            chosen, verdict = Gate(policy, models, seen, seed).choose(tuned)
+            chosen, verdict = Gate(policy, models, seen, seed, noise=noise).choose(tuned)
     keep("policy", chosen)
     clock.next("evaluate")
     flown = {"zero_shot": policy, "few_shot": chosen}

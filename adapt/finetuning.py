@@ -4,6 +4,7 @@ import time
 from dataclasses import replace
 
 from adapt.trust_region import Best
+from envs.dynamics import Sensed
 from envs.errors import InputError
 from policies import METHODS
 from policies.checkpoints import Policy
@@ -22,7 +23,7 @@ def usual_finetuning(method, system):
     return module.finetuning(module.PRESETS.get(system.name, module.Config()), system)
 
 
-def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None, judge=None, validations=0):
+def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None, judge=None, validations=0, noise=()):
     """Continue the training of a policy in other dynamics; the given policy stays as it is.
 
     Args:
@@ -34,6 +35,7 @@ def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None,
         judge: called with the network and the number of each update; returns what is added to its metrics.
         validations: how often the network flies validation episodes in the dynamics on the way. What flies best is
             returned, be it the policy as given; without any, what was trained last.
+        noise: of the sensors that it flies these episodes by, see `adapt.sensor_noise`.
 
     Returns:
         the new `Policy` and the metrics of each update, with the `seconds` spent until then without judging.
@@ -45,7 +47,8 @@ def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None,
     bank = policy.task.episodes(config.episodes, "train", seed).to(device)
     filmed = {} if footage is None else {"footage": footage}
     run = method.begin(dynamics, policy.task, [bank], config, seed, policy.network, **filmed)
-    best = Best(policy, dynamics, config.updates, validations) if validations else None
+    flown = Sensed(dynamics, noise) if noise else dynamics
+    best = Best(policy, flown, config.updates, validations) if validations else None
     updates = _judged(method.train(run, dynamics, policy.task, [bank], config), run, judge, best)
     history = list(progress(updates, total=config.updates) if progress else updates)
     if run.skipped == config.updates:

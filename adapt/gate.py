@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from adapt.trust_region import FARTHEST, SHARES, distance, part_way
+from envs.dynamics import Sensed
 from policies.compiled_dynamics import fastest
 from policies.evaluate import evaluate, test_episodes
 
@@ -83,13 +84,15 @@ class Gate:
 
     Args:
         task: as it is seen in the target, whose validation episodes are flown.
+        noise: of the sensors that both fly by, see `adapt.sensor_noise`.
     """
 
-    def __init__(self, old, models, task=None, seed=0, episodes=EPISODES):
+    def __init__(self, old, models, task=None, seed=0, episodes=EPISODES, noise=()):
         self.old, self.task, self.seed = old, task or old.task, seed
         device = next(old.network.parameters()).device
         compiled = device.type == "cpu"
-        self.models = {name: fastest(dynamics)[0] if compiled else dynamics for name, dynamics in models.items()}
+        quick = {name: fastest(dynamics)[0] if compiled else dynamics for name, dynamics in models.items()}
+        self.models = {name: Sensed(dynamics, noise) if noise else dynamics for name, dynamics in quick.items()}
         self.episodes = test_episodes(self.task, episodes, "validation", APART + seed).to(device)
         self.before = {name: self._fly(old, name) for name in models}
 

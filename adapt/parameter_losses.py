@@ -92,8 +92,18 @@ class Shooting:
         Raises:
             InputError: states or values from which no flight can be predicted.
         """
-        dynamics, system = changed(self.base, values), self.base.system
-        path = self.flown.predicted(dynamics, self.start)
+        path, slopes, inner, left = self.settle(changed(self.base, values))
+        parts = torch.cat((left[..., None], of_kicks(slopes, self._kicks(path, values, names))), -1)
+        rest = apart(self._scaled(parts), self._scaled(inner)).flatten(0, 1)
+        return rest[:, 0], rest[:, 1:]
+
+    def settle(self, dynamics):
+        """Estimate the initial states and the noise.
+
+        Returns:
+            the path (M, T + 1, n), the slopes of its steps and of its states by the first, and what is missed.
+        """
+        system, path = self.base.system, self.flown.predicted(dynamics, self.start)
         slopes = step_slopes(dynamics, path[:, :-1], self.flown.action)
         inner = of_start(slopes)
         for _ in range(SETTLING):
@@ -105,9 +115,7 @@ class Shooting:
             change = torch.linalg.lstsq(self._scaled(inner), self._scaled(left[..., None])).solution
             self.start = displaced(system, self.start, change.squeeze(-1))
             path = self.flown.predicted(dynamics, self.start)
-        parts = torch.cat((left[..., None], of_kicks(slopes, self._kicks(path, values, names))), -1)
-        rest = apart(self._scaled(parts), self._scaled(inner)).flatten(0, 1)
-        return rest[:, 0], rest[:, 1:]
+        return path, slopes, inner, left
 
     def _kicks(self, path, values, names):
         """What a change of each parameter, in its size, adds to every step of the path: (M, T, d, p)."""

@@ -113,6 +113,23 @@ class Dynamics:
         return casadi.Function("dynamics", [state, action], [following], ["state", "action"], ["next_state"])
 
 
+class Sensed:
+    """Dynamics as they are, flown by what sensors say that err.
+
+    Args:
+        noise: standard deviations, see `sensed`.
+    """
+
+    def __init__(self, dynamics, noise):
+        self.dynamics, self.noise = dynamics, noise
+
+    def __call__(self, state, action):
+        return self.dynamics(state, action)
+
+    def __getattr__(self, name):
+        return getattr(self.dynamics, name)
+
+
 def sensed(system, state, deviations, generator):
     """What sensors say of states (..., n): moved by white noise in their tangent space, so a quaternion stays one.
 
