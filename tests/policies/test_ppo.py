@@ -367,7 +367,8 @@ def test_no_more_transitions_are_taken_than_the_budget_and_all_are_counted(sampl
 
 def test_any_budget_lasts_for_several_updates_and_is_nearly_used_up():
     for samples in (1, 2, 15, 16, 17, 100, 1000, 1001, 5000, 150_000, 1_500_000):
-        for config in (*map(ppo.finetuning, ppo.PRESETS.values()), *ppo.PRESETS.values()):
+        tuned = [ppo.finetuning(config, make_system(name)) for name, config in ppo.PRESETS.items()]
+        for config in (*tuned, *ppo.PRESETS.values()):
             config = replace(config, samples=samples)
             used = config.updates * config.collected
             assert 0.9 * samples <= used <= samples or (samples < 100 and 0 < used <= samples)
