@@ -7,7 +7,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from adapt.figure_parts import BLUE, ORANGE, panels
-from adapt.plots import DPI, GREY, STYLE
+from adapt.plot_style import DPI, GREY, STYLE
 from policies.files import whole
 
 WORSE, BETTER = 1.05, 0.95  # new over old error beyond which a policy got worse or better

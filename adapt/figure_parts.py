@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, NullFormatter
 
 from adapt.experiment_table import MODES
-from adapt.plots import GREY
+from adapt.plot_style import GREY
 
 # Okabe and Ito 2008, in an order of falling importance; markers tell lines apart in print, too.
 BLUE, ORANGE, GREEN, PINK = "#0072B2", "#D55E00", "#009E73", "#CC79A7"

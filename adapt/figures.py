@@ -37,7 +37,7 @@ from adapt.figure_parts import (
     panels,
     published,
 )
-from adapt.plots import DPI, GREY, STYLE
+from adapt.plot_style import DPI, GREY, STYLE
 from adapt.table_cells import METHODS, MODE_NAMES
 from envs.errors import InputError
 from policies.files import replacing

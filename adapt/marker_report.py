@@ -47,7 +47,7 @@ def save(metrics, frames, path):
     """
     import matplotlib
 
-    from adapt.plots import DPI, STYLE
+    from adapt.plot_style import DPI, STYLE
     from policies.files import whole
 
     with matplotlib.rc_context(STYLE):
@@ -82,7 +82,7 @@ def _draw_frame(axes, frame):
 
 
 def _draw_bars(axes, errors, longest):
-    from adapt.plots import number
+    from adapt.plot_style import number
 
     places = range(len(errors))
     axes.barh(places, list(errors.values()), color=[COLOURS[name] for name in errors], height=0.7)

@@ -6,7 +6,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from adapt.plots import COLOURS, DPI, GREY, STYLE, small
+from adapt.plot_style import COLOURS, DPI, GREY, STYLE, small
 from policies.files import whole
 
 BEFORE = 5.0  # [s] before a change whose error counts

@@ -1,8 +1,6 @@
 """Pictures of an adaptation: the flight before and after, error over time, residual against truth, training.
 
-Each is drawn on a `Figure` of its own, without pyplot, so that nothing is shared and no window is opened. They are made
-to be read at half the width of a page: large type, thick lines, colours that colour-blind people tell apart (Okabe and
-Ito 2008), and a sequential map (plasma, without its pale end) for the error along a path.
+Each is drawn on a `Figure` of its own, without pyplot, so that nothing is shared and no window is opened.
 """
 
 from pathlib import Path
@@ -11,39 +9,28 @@ import matplotlib
 import numpy as np
 import torch
 from matplotlib.collections import LineCollection
-from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
-from adapt.prediction import GROUPS, predict
+from adapt.plot_style import (
+    COLOURS,
+    DPI,
+    ERROR_MAP,
+    GREY,
+    LIGHT,
+    LINES,
+    STYLE,
+    axis_of,
+    label,
+    number,
+    small,
+    smoothed,
+)
 from adapt.report import NAMES
-from envs.system import Axis
+from adapt.residual_plot import draw_residual
 from policies.files import whole
 
-DPI = 150
-GREY, LIGHT = "#595959", "#BDBDBD"
-COLOURS = {"source": GREY, "zero_shot": "#D55E00", "few_shot": "#0072B2", "oracle": "#009E73"}
-LINES = {"source": "--", "oracle": (0, (2, 2))}  # what lies below the oracle's line, as few-shot should, is seen
-STYLE = {
-    "font.size": 13,
-    "axes.titlesize": 14,
-    "axes.labelsize": 13,
-    "figure.titlesize": 15,
-    "legend.fontsize": 12,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": GREY,
-    "axes.linewidth": 1.2,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#E6E6E6",
-    "grid.linewidth": 1.0,
-    "lines.linewidth": 2.8,
-    "lines.solid_capstyle": "round",
-    "legend.frameon": False,
-    "figure.facecolor": "white",
-}
-ERROR_MAP = LinearSegmentedColormap.from_list("error", matplotlib.colormaps["plasma"](np.linspace(0.0, 0.82, 256)))
 PANEL = 2.7  # [inch] width of one picture of a flight
 
 
@@ -92,15 +79,6 @@ def traces(task, evaluation):
     return np.where(after | ~np.isfinite(trace), np.nan, trace)
 
 
-def small(values, unit):
-    """Factor and unit in which lengths or speeds are easy to read: centimetres where all are below one metre."""
-    finite = np.abs(np.asarray(values, dtype=float))
-    finite = finite[np.isfinite(finite)]
-    if unit.split("/")[0] == "m" and len(finite) and finite.max() < 1:
-        return 100.0, "c" + unit
-    return 1.0, unit
-
-
 def score(evaluation, scale):
     """The mean metric of an evaluation in words, and how many flights failed if any did."""
     factor, unit = scale
@@ -122,26 +100,6 @@ def score_scale(adaptation):
     """The scale in which all scores are told."""
     means = [evaluation.summary["mean"] for evaluation in adaptation.evaluations.values()]
     return small(means, adaptation.evaluations["zero_shot"].unit)
-
-
-def number(value):
-    """Two significant digits, without an exponent."""
-    if not np.isfinite(value):
-        return "–"
-    if value and abs(value) < 1e-3:
-        return "< 0.001"
-    digits = 1 - int(np.floor(np.log10(abs(value) or 1.0)))
-    return f"{value:.{min(max(digits, 0), 3)}f}"
-
-
-def axis_of(system, name):
-    """How a state, or the time "t", is shown."""
-    return Axis("time", "s") if name == "t" else system.axes.get(name, Axis(name, ""))
-
-
-def label(axis, power=""):
-    """An axis label with its unit."""
-    return f"{axis.label} [{axis.unit}{power}]" if axis.unit else axis.label
 
 
 def views_of(task):
@@ -259,92 +217,6 @@ def _flying(trace):
     return np.isfinite(trace).mean(0) >= 0.5
 
 
-# --- residual ---------------------------------------------------------------------------------------------------------
-
-
-def draw_residual(adaptation):
-    """What the model lacks in each transition, measured, against what the residual adds."""
-    system, transitions = adaptation.policy.task.system, adaptation.transitions
-    lack, added = lacks(adaptation)
-    rows = _rows(matters(system, transitions, lack, added))
-    width = max(len(names) for names in rows)
-    panel = min(max(2.2, 5.6 / width), 3.6)
-    figure = Figure(figsize=(0.7 + panel * width, 1.0 + (0.35 + panel) * len(rows)), layout="constrained")
-    grid = figure.subplots(len(rows), width, squeeze=False)
-    for axes in grid.flat:
-        axes.set_visible(False)
-    for names, row in zip(rows, grid, strict=True):
-        for axes, name in zip(row, names, strict=False):
-            place, axis = system.accelerations.index(name), axis_of(system, name)
-            axes.set_visible(True)
-            _draw_lack(axes, lack[:, place], added[:, place])
-            axes.set_title(axis.label)
-            axes.set_xlabel(f"[{axis.unit}²]" if axis.unit else "")
-    figure.supxlabel("acceleration that the model lacks")
-    figure.supylabel("residual adds")
-    figure.suptitle(_prediction(adaptation, [name for names in rows for name in names]))
-    return figure
-
-
-def _rows(names):
-    """Names in rows of at most three, as even as they go."""
-    width = 2 if len(names) == 4 else 3
-    return [names[i : i + width] for i in range(0, len(names), width)]
-
-
-def lacks(adaptation):
-    """Accelerations (N, k) that the model lacks by the transitions, and those that the residual adds.
-
-    Both are differences over one control period, divided by it, of the rows `accelerations` of the state.
-    """
-    residual, transitions = adaptation.residual, adaptation.transitions
-    rows = [transitions.state_names.index(name) for name in residual.system.accelerations]
-    with torch.no_grad():
-        model, learned = predict(residual.base, transitions), predict(residual, transitions)
-    differences = (transitions.next_state - model, learned - model)
-    return tuple((d[:, rows] / transitions.dt).cpu().double().numpy() for d in differences)
-
-
-def matters(system, transitions, lack, added, share=0.01):
-    """Names of accelerations that the model lacks, or the residual adds, by more than a share of what is flown.
-
-    What turns and what moves are measured apart, each by its largest acceleration. The largest stays if none matters.
-    """
-    rows = [transitions.state_names.index(name) for name in system.accelerations]
-    change = ((transitions.next_state - transitions.state)[:, rows] / transitions.dt).cpu().double().numpy()
-    flown, size = (np.sqrt(np.square(part).mean(0)) for part in (change, np.maximum(np.abs(lack), np.abs(added))))
-    turning = np.array([name in GROUPS["rates"] for name in system.accelerations])
-    largest = [flown[turning == turns].max() for turns in turning]
-    ratio = size / np.maximum(largest, 1e-9)
-    chosen = ratio > min(share, 0.999 * ratio.max())
-    chosen[ratio.argmax()] = True
-    return [name for name, on in zip(system.accelerations, chosen, strict=True) if on]
-
-
-def _draw_lack(axes, lack, added):
-    """Points on and around the diagonal; both directions have the same scale."""
-    both = np.concatenate((lack, added))
-    middle, reach = (both.max() + both.min()) / 2, max(0.55 * (both.max() - both.min()), 0.01)
-    limits = (middle - reach, middle + reach)
-    axes.plot(limits, limits, color=LIGHT, linewidth=7, zorder=1)
-    size = float(np.clip(6000 / len(lack), 8, 40))
-    axes.scatter(lack, added, s=size, color=COLOURS["few_shot"], alpha=0.6, linewidth=0, zorder=2)
-    axes.set(xlim=limits, ylim=limits, aspect="equal")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(3))
-
-
-def _prediction(adaptation, names):
-    """One-step errors on held-out transitions before and after, of the groups that are shown."""
-    before, after = (adaptation.prediction[name] for name in ("model", "model + residual"))
-    units = {"acceleration": ("velocity", "m/s²"), "angular_acceleration": ("rates", "rad/s²")}
-    said = []
-    for key, (group, unit) in units.items():
-        if key in before and set(names) & set(GROUPS[group]):
-            said.append(f"{number(before[key])} → {number(after[key])} {unit}")
-    return "RMS on held-out transitions\n" + ", ".join(said)
-
-
 # --- training ---------------------------------------------------------------------------------------------------------
 
 
@@ -377,14 +249,6 @@ def _log_scale(axes, values, room):
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if 3 * decades <= room else (1,), numticks=room))
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-def smoothed(values):
-    """Running median over a tenth of the values, shorter at both ends, without those that aren't finite."""
-    half = max(1, len(values) // 20)
-    windows = [values[max(0, i - half) : i + half + 1] for i in range(len(values))]
-    finite = [window[np.isfinite(window)] for window in windows]
-    return np.array([np.median(window) if len(window) else np.nan for window in finite])
 
 
 PICTURES = {"flight": draw_flight, "error": draw_error, "residual": draw_residual, "training": draw_training}

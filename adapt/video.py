@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from adapt import plots
-from adapt.plots import COLOURS, GREY, LIGHT
+from adapt.plot_style import COLOURS, GREY, LIGHT, number, small
 from adapt.report import NAMES
 from envs.dynamics import TORCH
 from envs.errors import InputError
@@ -149,9 +149,9 @@ def _flight(adaptation, name, row, times):
     states = TORCH.pack(task.system.project(task.system.State(*states.unbind(-1))))
     trail = np.array([_floats(task.system.place(_scalars(task.system, state))) for state in states])
     error = _at(torch.as_tensor(plots.traces(task, evaluation)[row]).nan_to_num(), steps).numpy()
-    factor, unit = plots.small([error.max()], task.trace_unit)
+    factor, unit = small([error.max()], task.trace_unit)
     title = f"{NAMES[name]}, mean of all: {plots.score(evaluation, plots.score_scale(adaptation))}"
-    errors = [f"{task.trace_name} {plots.number(value)} {unit}" for value in factor * error]
+    errors = [f"{task.trace_name} {number(value)} {unit}" for value in factor * error]
     return Flight(title, _colour(COLOURS[name]), states, trail, errors)
 
 

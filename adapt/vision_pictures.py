@@ -11,7 +11,7 @@ import torch
 from matplotlib.figure import Figure
 from tensordict import TensorDict
 
-from adapt.plots import COLOURS, DPI, GREY, STYLE
+from adapt.plot_style import COLOURS, DPI, GREY, STYLE
 from adapt.video import FONT, write_frames
 from envs.drawing import draw
 from policies.files import whole

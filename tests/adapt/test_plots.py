@@ -13,7 +13,7 @@ import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
-from adapt import plots, video
+from adapt import plot_style, plots, residual_plot, video
 from adapt.adaptation import Adaptation
 from adapt.finetuning import finetune
 from adapt.flying import collect
@@ -113,7 +113,7 @@ def test_titles_of_flights_that_fail_in_part_do_not_run_into_each_other(quadroto
     table = pd.DataFrame({"error": 0.76, "success": [True] * 14 + [False] * 16})
     evaluations = {name: replace(one, table=table) for name, one in quadrotor.evaluations.items()}
     some = replace(quadrotor, evaluations=evaluations)
-    with matplotlib.rc_context(plots.STYLE):
+    with matplotlib.rc_context(plot_style.STYLE):
         figure = plots.draw_training(some)
         figure.draw_without_rendering()
     left, right = (getattr(figure.axes[0], name).get_window_extent() for name in ("_left_title", "_right_title"))
@@ -167,42 +167,43 @@ def test_the_error_is_not_drawn_behind_the_end_of_an_episode():
 
 
 def test_a_drag_that_was_learned_lies_on_the_diagonal_and_is_all_that_is_shown(quadrotor):
-    lack, added = plots.lacks(quadrotor)
+    lack, added = residual_plot.lacks(quadrotor)
     flying = (quadrotor.transitions.state + quadrotor.transitions.next_state)[:, 7:10] / 2
     np.testing.assert_allclose(lack[:, :3], -DRAG * flying, atol=2e-3)
     np.testing.assert_allclose(added, lack, atol=2e-3)
-    assert plots.matters(quadrotor.policy.task.system, quadrotor.transitions, lack, added) == ["vx", "vy", "vz"]
+    assert residual_plot.matters(quadrotor.policy.task.system, quadrotor.transitions, lack, added) == ["vx", "vy", "vz"]
 
 
 def test_a_residual_that_learned_nothing_adds_nothing(quadrotor):
     unfitted = make_residual(Dynamics(quadrotor.policy.task.system))
-    lack, added = plots.lacks(replace(quadrotor, residual=unfitted))
+    lack, added = residual_plot.lacks(replace(quadrotor, residual=unfitted))
     assert np.abs(added).max() == 0
-    np.testing.assert_array_equal(lack, plots.lacks(quadrotor)[0])
+    np.testing.assert_array_equal(lack, residual_plot.lacks(quadrotor)[0])
 
 
 def test_one_acceleration_is_shown_even_where_the_model_lacks_nothing(quadrotor):
     nothing = np.zeros((len(quadrotor.transitions), 6))
-    assert plots.matters(quadrotor.policy.task.system, quadrotor.transitions, nothing, nothing) == ["vx"]
+    assert residual_plot.matters(quadrotor.policy.task.system, quadrotor.transitions, nothing, nothing) == ["vx"]
 
 
 def test_numbers_have_two_digits_and_no_exponent():
     values = [0.0, 0.0004, 0.0234, 0.56, 1.28, 10.76, 128.3, math.nan]
-    assert [plots.number(value) for value in values] == ["0.0", "< 0.001", "0.023", "0.56", "1.3", "11", "128", "–"]
+    shown = ["0.0", "< 0.001", "0.023", "0.56", "1.3", "11", "128", "–"]
+    assert [plot_style.number(value) for value in values] == shown
 
 
 def test_lengths_below_a_metre_are_told_in_centimetres():
-    assert plots.small([0.1, math.nan], "m") == (100.0, "cm")
-    assert plots.small([0.1, 0.2], "m/s") == (100.0, "cm/s")
-    assert plots.small([0.1, 1.2], "m") == (1.0, "m")
-    assert plots.small([0.1], "rad") == (1.0, "rad")
+    assert plot_style.small([0.1, math.nan], "m") == (100.0, "cm")
+    assert plot_style.small([0.1, 0.2], "m/s") == (100.0, "cm/s")
+    assert plot_style.small([0.1, 1.2], "m") == (1.0, "m")
+    assert plot_style.small([0.1], "rad") == (1.0, "rad")
 
 
 def test_smoothing_passes_over_a_spike_and_over_what_is_not_finite():
     values = np.ones(60)
     values[[10, 30]] = 1e6, math.nan
-    assert (plots.smoothed(values) == 1).all()
-    assert np.isnan(plots.smoothed(np.array([math.nan]))).all()
+    assert (plot_style.smoothed(values) == 1).all()
+    assert np.isnan(plot_style.smoothed(np.array([math.nan]))).all()
 
 
 # --- how robots and jobs describe themselves --------------------------------------------------------------------------
