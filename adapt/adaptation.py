@@ -12,7 +12,7 @@ from adapt import residual as residuals
 from adapt.bootstrap import fit_ensemble
 from adapt.clock import Clock
 from adapt.finetuning import Judge, finetune, finetuning
-from adapt.gate import UNCHANGED, Gate, Verdict
+from adapt.gate import Gate, Verdict, nothing_found
 from adapt.labelling import check_labels
 from adapt.mending import mended, still_true
 from adapt.plants import flights_of
@@ -159,14 +159,14 @@ def adapt(
     chosen, verdict = tuned, None
     if gate:
         clock.next("gate")
-        chosen, verdict = policy, UNCHANGED
+        chosen, verdict = policy, nothing_found(noise)
         if not same_weights(policy, tuned):
             models = {"the fit": learned} | _alternatives(policy, transitions, source, fit, context, seed, device)
             chosen, verdict = Gate(policy, models, seen, seed, noise=noise).choose(tuned)
     keep("policy", chosen)
     clock.next("evaluate")
     flown = {"zero_shot": policy, "few_shot": chosen}
-    if chosen is policy and verdict is not UNCHANGED and plant is None:  # no plant is risked for it
+    if chosen is policy and not same_weights(policy, tuned) and plant is None:  # no plant is risked for it
         flown["refused"] = tuned
     evaluations |= _evaluated(flown, truth, seen, tests, seed)
     best = None

@@ -4,7 +4,6 @@ import time
 from dataclasses import replace
 
 from adapt.trust_region import Best
-from envs.dynamics import Sensed
 from envs.errors import InputError
 from policies import METHODS
 from policies.checkpoints import Policy
@@ -47,8 +46,7 @@ def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None,
     bank = policy.task.episodes(config.episodes, "train", seed).to(device)
     filmed = {} if footage is None else {"footage": footage}
     run = method.begin(dynamics, policy.task, [bank], config, seed, policy.network, **filmed)
-    flown = Sensed(dynamics, noise) if noise else dynamics
-    best = Best(policy, flown, config.updates, validations) if validations else None
+    best = Best(policy, dynamics, config.updates, validations, noise=noise) if validations else None
     updates = _judged(method.train(run, dynamics, policy.task, [bank], config), run, judge, best)
     history = list(progress(updates, total=config.updates) if progress else updates)
     if run.skipped == config.updates:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from adapt.trust_region import FARTHEST, SHARES, distance, part_way
+from adapt.trust_region import FARTHEST, NOISY, SHARES, distance, part_way
 from envs.dynamics import Sensed
 from policies.compiled_dynamics import fastest
 from policies.evaluate import evaluate, test_episodes
@@ -76,7 +76,12 @@ class Verdict:
 
 
 NOTHING_FOUND = "fine-tuning found nothing that flies better in the fitted model"
-UNCHANGED = Verdict(False, NOTHING_FOUND, 0.0, 0.0, {}, distance=0.0)
+BY_SENSORS = ", by sensors that err as those did that recorded the flight"
+
+
+def nothing_found(noise=()):
+    """The `Verdict` where fine-tuning, validated by sensors with such noise, left the policy as it was."""
+    return Verdict(False, NOTHING_FOUND + (BY_SENSORS if noise else ""), 0.0, 0.0, {}, distance=0.0)
 
 
 class Gate:
@@ -84,6 +89,7 @@ class Gate:
 
     Args:
         task: as it is seen in the target, whose validation episodes are flown.
+        episodes: flown in each model, `NOISY` times as many by noisy sensors.
         noise: of the sensors that both fly by, see `adapt.sensor_noise`.
     """
 
@@ -93,7 +99,8 @@ class Gate:
         compiled = device.type == "cpu"
         quick = {name: fastest(dynamics)[0] if compiled else dynamics for name, dynamics in models.items()}
         self.models = {name: Sensed(dynamics, noise) if noise else dynamics for name, dynamics in quick.items()}
-        self.episodes = test_episodes(self.task, episodes, "validation", APART + seed).to(device)
+        count = NOISY * episodes if noise else episodes
+        self.episodes = test_episodes(self.task, count, "validation", APART + seed).to(device)
         self.before = {name: self._fly(old, name) for name in models}
 
     def _fly(self, policy, name):

@@ -15,6 +15,7 @@ from adapt.stretches import difference
 from envs.errors import InputError
 
 FAR_BETTER = 0.2  # [-] by which the logarithm of what the model misses falls
+SURE = 5.0  # standard errors of it: few noisy transitions may fall into any pattern
 FEWEST = 5  # transitions that a shift in time is judged by
 MISSED = 1e-6  # [m/s, rad/s] over a period that is as good as nothing
 DELAYED = "with each action one control period later"
@@ -34,9 +35,10 @@ def check_labels(transitions, base):
     Raises:
         InputError: the model explains the record far better with other labels; names them.
     """
-    found = [(_gain(base, recorded, other), words) for words, recorded, other in _labellings(transitions)]
-    gain, words = max(found)
-    if gain > FAR_BETTER:
+    found = [(*_gain(base, recorded, other), words) for words, recorded, other in _labellings(transitions)]
+    sure = [(gain, words) for gain, doubt, words in found if gain > max(FAR_BETTER, SURE * doubt)]
+    if sure:
+        gain, words = max(sure)
         better = f"the model explains them {math.exp(gain):.1f} times as well {words}"
         if words != DELAYED:
             raise InputError(f"transitions: {better}; put the actions right and begin again")
@@ -64,12 +66,20 @@ def _labellings(data):
 
 @torch.no_grad()
 def _gain(base, recorded, other):
-    """By how much the logarithm of what the model misses falls, as a standard deviation, mean of its quantities."""
-    return float((_missed(base, recorded) / _missed(base, other)).log().mean())
+    """By how much the logarithm of what the model misses falls, mean of its quantities, and the standard error of it.
+
+    What is missed is a standard deviation over the transitions; its logarithm is half that of the mean square.
+    """
+    squares = [_squares(base, data) for data in (recorded, other)]
+    means = [square.mean(0) + MISSED**2 for square in squares]
+    each = [(square / mean).mean(-1) / 2 for square, mean in zip(squares, means, strict=True)]
+    gain = (means[0] / means[1]).log().mean() / 2
+    return float(gain), float((each[0] - each[1]).std()) / len(each[0]) ** 0.5
 
 
-def _missed(base, data):
+def _squares(base, data):
+    """(N, k) what the model misses, squared; its mean is left to wind and drag."""
     system, data = base.system, data.double()
     missed = difference(system, base(data.state, data.action), data.next_state)
     rows = [i for i, quantity in enumerate(system.quantities) if quantity in QUANTITIES] or slice(None)
-    return missed[:, rows].std(0, correction=0) + MISSED  # the mean is left to wind and drag
+    return (missed[:, rows] - missed[:, rows].mean(0)).square()

@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import torch
 
+from envs.dynamics import Sensed
 from policies import METHODS
 from policies.evaluate import evaluate, test_episodes
 
+NOISY = 8  # times as many validation episodes where sensors err: errors scatter by it, and all fly side by side
 FARTHEST = 1.0  # [-] root mean square change of the actions, which span -1 to 1
 SHARES = (1.0, 0.5, 0.25)  # of the way that are tried, as a line search does
 
@@ -18,11 +20,14 @@ class Best:
     Args:
         dynamics: to fly in, those that the policy is tuned in.
         updates: in all; it flies `times` on the way, the last time after the last update.
+        noise: of the sensors that it flies by, see `adapt.sensor_noise`; takes `NOISY` times as many episodes.
     """
 
-    def __init__(self, policy, dynamics, updates, times, episodes=16):
-        self.policy, self.dynamics, self.every, self.last = policy, dynamics, max(1, updates // times), updates
-        self.episodes = test_episodes(policy.task, episodes, "validation", seed=1)  # others than the gate's
+    def __init__(self, policy, dynamics, updates, times, episodes=16, noise=()):
+        self.policy, self.every, self.last = policy, max(1, updates // times), updates
+        self.dynamics = Sensed(dynamics, noise) if noise else dynamics
+        count = NOISY * episodes if noise else episodes
+        self.episodes = test_episodes(policy.task, count, "validation", seed=1)  # others than the gate's
         self.update, self.score = 0, None
         self(policy.network, 0)
 

@@ -127,6 +127,8 @@ class Sensed:
         return self.dynamics(state, action)
 
     def __getattr__(self, name):
+        if name == "dynamics":  # a copy asks for it before it has any
+            raise AttributeError(name)
         return getattr(self.dynamics, name)
 
 
