@@ -213,6 +213,9 @@ def _adapt(options, setting, policy, recorded, folder, device):
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"what was finished is in {folder}") from None
     except InputError as error:
+        if recorded is not None or not (folder / "transitions.csv").exists():  # nothing was flown that would be lost
+            for name in RESULTS:
+                (folder / name).unlink(missing_ok=True)
         sources = ", ".join((*options.log, *filter(None, [options.transitions])))
         if sources and str(error).startswith("transitions:"):
             raise InputError(str(error).replace("transitions", sources, 1)) from None

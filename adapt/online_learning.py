@@ -15,6 +15,7 @@ from adapt.gate import Gate, Verdict
 from adapt.online_window import likelihood
 from adapt.residual import fit_residual
 from adapt.residual_dynamics import ResidualDynamics
+from adapt.sensor_noise import sensor_noise
 from adapt.transitions import Transitions
 from envs.dynamics import Dynamics
 from envs.errors import InputError
@@ -100,7 +101,8 @@ def _learn(job, settings):
     )
     models = {"the fit": dynamics} | {f"resampled flight {i + 1}": member for i, member in enumerate(members)}
     task = shortened(job.flying.task, settings.periods)
-    chosen, verdict = Gate(job.flying, models, task, settings.seed, settings.tests).choose(tuned)
+    noise = sensor_noise(residual, job.window)
+    chosen, verdict = Gate(job.flying, models, task, settings.seed, settings.tests, noise).choose(tuned)
     new = None if chosen is job.flying else chosen
     return Lesson(residual, fitted, new, verdict.reason, described(residual), verdict)
 

@@ -130,7 +130,8 @@ class Flights:
         names = self.system.State._fields
         if values.shape != (len(names),):
             found = f"{type(answer).__name__} of shape {np.shape(values)}" if values.size else type(answer).__name__
-            wrong = f"state is {found}, expected ({len(names)},) for {', '.join(names)}"
+            method = "step" if self._step else "reset"
+            wrong = f"{method} returned {found}, expected numbers of shape ({len(names)},): {', '.join(names)}"
             if not self.steps and self.count == 1:  # never right: a mistake to mend, not a flight that broke
                 raise InputError(f"{self.name}: {wrong}")
             return wrong

@@ -92,7 +92,7 @@ def score(evaluation, scale):
 
 def _say_score(axes, name, evaluation, scale, side):
     """The same as a title, in its colour; failed flights in a line of their own, so that two titles have room."""
-    said = f"{NAMES[name]}: {score(evaluation, scale)}".replace(", ", ",\n")
+    said = f"{NAMES[name]}: {score(evaluation, scale)}".replace(", ", ",\n").replace(": all ", ":\nall ")
     axes.set_title(said, loc=side, color=COLOURS[name], fontweight="bold")
 
 

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -373,6 +374,16 @@ def test_transitions_that_can_not_be_used_are_refused_by_row_or_column(refused, 
     assert words in line
     assert str(path) in line
     assert not (tmp_path / "run").exists()
+
+
+def test_actions_that_are_refused_leave_an_empty_folder_to_the_mended_command(call, refused, finished, quick, tmp_path):
+    right, wrong, out = finished[0] / "transitions.csv", tmp_path / "wrong.csv", tmp_path / "run"
+    record = Transitions.load(right)
+    replace(record, action=record.action * torch.tensor([1.0, -1.0, 1.0, 1.0])).save(wrong)
+    line = refused("fewshot", *quick, "--transitions", wrong, "--out", out)
+    assert line.startswith(f"fewshot: {wrong}: the model explains them")
+    assert list(out.iterdir()) == []
+    assert call("fewshot", *quick, "--transitions", right, "--out", out).status == 0
 
 
 def test_a_used_folder_is_left_alone_unless_overwriting_is_asked_for(call, refused, cart, tmp_path, contents):

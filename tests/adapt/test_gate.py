@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from adapt.gate import Flown, Gate, decide
-from adapt.trust_region import Best, distance, part_way
+from adapt.trust_region import NOISY, Best, distance, part_way
 from envs import make_dynamics
 from policies import evaluate as flights
 from policies.checkpoints import load_policy
@@ -161,3 +161,10 @@ def test_the_best_weights_on_the_way_are_kept(cart):
     other = Best(bad, make_dynamics("cartpole"), updates=4, times=2, episodes=4)
     other(cart.network, 2)
     assert other.update == 2
+
+
+def test_by_noisy_sensors_weights_are_chosen_by_how_they_fly_with_the_noise(cart):
+    source, noise = make_dynamics("cartpole"), (0.01, 0.1, 0.05, 0.2)
+    exact, noisy = (Best(cart, source, updates=4, times=2, episodes=4, noise=which) for which in ((), noise))
+    assert len(noisy.episodes) == NOISY * len(exact.episodes)
+    assert noisy.score[1] < 2 * exact.score[1] < 0  # minus the error

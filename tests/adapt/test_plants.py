@@ -127,8 +127,11 @@ FAULTS = {
     "nan": (lambda: [0.0, np.nan, 0.0, 0.0], "v is not finite"),
     "death": (lambda: raised(ConnectionError("link\nlost")), "ConnectionError: link lost"),
     "beyond all bounds": (lambda: [0.0, 1e30, 0.0, 0.0], "v is 1e\\+30"),
-    "shape": (lambda: [0.0, 0.0], r"state is list of shape \(2,\), expected \(4,\) for x, v, theta, omega"),
-    "nothing": (lambda: "no fix", "state is str, expected"),
+    "shape": (
+        lambda: [0.0, 0.0],
+        r"step returned list of shape \(2,\), expected numbers of shape \(4,\): x, v, theta, omega",
+    ),
+    "nothing": (lambda: "no fix", "step returned str, expected numbers"),
 }
 
 
@@ -229,9 +232,9 @@ def test_a_plant_that_never_flies_is_refused_with_the_reason(policy, target):
 
 
 def test_a_shape_that_was_never_right_is_refused_at_once(policy, target):
-    for when in (0, 1):
+    for when, method in enumerate(("reset", "step")):
         wrong = as_plant(policy, target, breaks=lambda flight, step, when=when: np.zeros(5) if step == when else None)
-        with pytest.raises(InputError, match=r"plant: state is ndarray of shape \(5,\), expected \(4,\)"):
+        with pytest.raises(InputError, match=rf"plant: {method} returned ndarray of shape \(5,\), expected numbers"):
             flown(policy, wrong)
 
 

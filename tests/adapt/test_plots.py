@@ -102,22 +102,23 @@ def test_every_picture_of_every_system_can_be_read_and_shows_something(adaptatio
 def test_an_oracle_and_flights_that_all_fail_can_be_drawn(quadrotor):
     failed = with_table(quadrotor, "zero_shot", success=False)
     both = replace(failed, evaluations={**failed.evaluations, "oracle": quadrotor.evaluations["few_shot"]})
-    assert plots.draw_training(both).axes[0].get_title("left") == "zero-shot: all 5 flights fail"
+    assert plots.draw_training(both).axes[0].get_title("left") == "zero-shot:\nall 5 flights fail"
     axes = plots.draw_error(both).axes[0]
     said = [text.get_text() for text in axes.get_legend().get_texts()]
     assert "zero-shot: all 5 flights fail" in said
     assert any(text.startswith("oracle: ") for text in said)
 
 
-def test_titles_of_flights_that_fail_in_part_do_not_run_into_each_other(quadrotor):
-    table = pd.DataFrame({"error": 0.76, "success": [True] * 14 + [False] * 16})
+@pytest.mark.parametrize(("failed", "said"), [(16, "16 of 30 fail"), (30, "all 30 flights fail")])
+def test_titles_of_flights_that_fail_do_not_run_into_each_other(quadrotor, failed, said):
+    table = pd.DataFrame({"error": 0.76, "success": [True] * (30 - failed) + [False] * failed})
     evaluations = {name: replace(one, table=table) for name, one in quadrotor.evaluations.items()}
     some = replace(quadrotor, evaluations=evaluations)
     with matplotlib.rc_context(plot_style.STYLE):
         figure = plots.draw_training(some)
         figure.draw_without_rendering()
     left, right = (getattr(figure.axes[0], name).get_window_extent() for name in ("_left_title", "_right_title"))
-    assert "16 of 30 fail" in figure.axes[0].get_title("left")
+    assert said in figure.axes[0].get_title("left")
     assert left.x1 < right.x0
 
 
