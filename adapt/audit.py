@@ -56,7 +56,7 @@ class Options:
     system: Repeatable = ()
     """Robot: cartpole, quadrotor or fixed_wing; may be repeated (default: all)."""
     seed: int = 0
-    """Seed of everything that is drawn."""
+    """Seed of everything that is drawn; cases of other seeds in the same folder stay and are not reported on."""
     episodes: int = 20
     """Test episodes that each policy is flown on."""
     oracle: bool = False
@@ -70,16 +70,18 @@ class Options:
 
 
 def main(options):
-    """Carry out the cases that are missing, then report on all."""
+    """Carry out the cases of a seed that are missing, then report on all of that seed."""
     _check(options)
     from adapt import audit_report
 
     folder = Path(options.out)
     if not options.summary:
         _audit(options, command.output_folder(folder, overwrite=True))
-    rows = audit_report.numbers(read(folder))
+    table = read(folder)
+    rows = audit_report.numbers(table[table.seed == str(options.seed)])
     if rows.empty:
-        raise InputError(f"{folder / TABLE}: there are no cases; leave out --summary to make some")
+        known = f", only of {', '.join(sorted(set(table.seed)))}" if len(table) else ""
+        raise InputError(f"{folder / TABLE}: there are no cases of --seed {options.seed}{known}; leave out --summary")
     print(audit_report.table(rows))
     audit_report.save(rows, folder / PICTURE)
     print(f"cases in {folder / TABLE}, picture in {folder / PICTURE}")

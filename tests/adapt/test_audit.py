@@ -123,6 +123,14 @@ def test_rows_of_another_seed_stay(call, carried_out, tmp_path):
     assert read(tmp_path).seed.tolist() == ["0", "5"]
 
 
+def test_cases_of_another_seed_are_not_reported_on(call, tmp_path):
+    for seed in (4, 5, 5):
+        add(tmp_path, row(system="cartpole", seed=seed, index=seed))
+    add(tmp_path, row(system="quadrotor", seed=4))
+    answer = call("audit", "--summary", "--seed", 5, "--out", tmp_path)
+    assert "cartpole" in answer.out and "quadrotor" not in answer.out
+
+
 @pytest.mark.parametrize("option", ["targets", "episodes", "jobs"])
 def test_numbers_below_1_are_refused(refused, option, tmp_path):
     assert f"--{option} 0: expected at least 1" in refused("audit", f"--{option}", 0, "--out", tmp_path)
@@ -138,7 +146,9 @@ def test_cases_of_other_test_episodes_are_not_mixed(refused, tmp_path):
 
 
 def test_a_summary_of_nothing_and_a_table_of_something_else_are_refused(refused, tmp_path):
-    assert "there are no cases" in refused("audit", "--summary", "--out", tmp_path)
+    assert "there are no cases of --seed 0; leave out" in refused("audit", "--summary", "--out", tmp_path)
+    add(tmp_path, row(seed=5))
+    assert "of --seed 1, only of 5;" in refused("audit", "--summary", "--seed", 1, "--out", tmp_path)
     (tmp_path / TABLE).write_text("system,error\nquadrotor,1\n")
     assert "has no column index" in refused("audit", "--summary", "--out", tmp_path)
 
