@@ -250,6 +250,10 @@ def _status(options):
     from adapt import experiment_results, sweep
 
     names, seeds = pick(options.names or ("all",)), _seeds(options.seeds)
+    if not Path(options.results).is_dir():
+        raise InputError(
+            f"--results {options.results}: no such folder; expected one with experiments.csv, which run makes"
+        )
     results = experiment_results.Results(options.results)
     rows, left, untimed = [], 0.0, 0
     for name in names:
@@ -264,8 +268,8 @@ def _status(options):
         note = "for a cluster" if cluster else ""
         rows.append((name, f"{len(done)} of {len(runs)}", len(old) or "", minutes and f"{minutes:.1f}", note))
     print(_tabulated(rows, ("experiment", "done", "with other settings", "minutes a seed", "")))
-    rest = f", and {untimed} runs that have never been timed" if untimed else ""
-    print(f"about {left:.0f} minutes of one core are left{rest}")
+    timed = [] if untimed and not left else [f"about {left:.0f} minutes of one core"]
+    print(f"left: {' and '.join(timed + [f'{untimed} runs that have never been timed'] * bool(untimed))}")
 
 
 def _gather(options):

@@ -19,7 +19,7 @@ A column of a CSV is the name in its header. One of a PX4 ULog is `topic.field`,
 `/odometry.pose.pose.position.x`. The topic of the time column is the clock to which the others are brought, see
 `adapt.log_topics`. In a ROS bag `/topic.recorded` is the time of recording, and times are in seconds.
 
-The shipped mappings of topics are the TOML files in `adapt/mapping_data/`: copy one and change the names.
+Files to copy are in `adapt/mapping_data/`: `csv.toml`, and the shipped mappings of topics.
 """
 
 from dataclasses import dataclass, field, replace
@@ -244,5 +244,5 @@ def choose_mapping(mappings, columns, log, lacks=_columns_are_missing):
         raise InputError(f"{log}: mapping {closest} needs {lacks(missing[closest])}")
     raise InputError(
         f"{log}: no built-in mapping fits; {closest} is closest and needs {lacks(missing[closest])}; "
-        "describe the log in a mapping .toml file"
+        f"copy a file of {resources.files('adapt') / 'mapping_data'}, put your names in, and give it with --mapping"
     )

@@ -41,7 +41,12 @@ def test_status_counts_what_is_missing(call, tmp_path):
     answer = call("experiments", "status", "curriculum", "--seeds", "0..2", "--results", tmp_path)
     assert answer.status == 0
     assert answer.out.count("0 of 3") == 4
-    assert "about 0 minutes of one core are left, and 12 runs that have never been timed" in answer.out
+    assert answer.out.endswith("left: 12 runs that have never been timed\n")
+
+
+def test_status_of_a_folder_that_is_not_there_is_refused(refused, tmp_path):
+    line = refused("experiments", "status", "curriculum", "--results", tmp_path / "nothing")
+    assert f"--results {tmp_path / 'nothing'}: no such folder" in line
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,12 @@ import pandas as pd
 import pytest
 import torch
 
+from adapt import mappings
 from adapt.control_periods import BLIND, MEMORY, held_command, window_means
 from adapt.log_cleaning import REASONS, reject
 from adapt.log_rows import convert, rotation_matrices
 from adapt.logs import flight_transitions, read_flight
-from adapt.mappings import MAPPINGS
+from adapt.mappings import MAPPINGS, find_mappings
 from envs.dynamics import Dynamics
 from envs.errors import InputError
 from envs.vehicles import load_vehicle
@@ -410,6 +411,14 @@ def test_files_that_are_no_flight_log_say_so_in_one_line(tmp_path):
         with pytest.raises(InputError, match=message) as caught:
             read_flight(path, VEHICLE)
         assert "\n" not in str(caught.value)
+
+
+def test_the_mapping_to_copy_names_the_columns_that_are_recognised_anyway():
+    (to_copy,) = find_mappings(Path(mappings.__file__).parent / "mapping_data" / "csv.toml")
+    for name, quantity in to_copy.quantities.items():
+        if name in MAPPINGS["motors"].quantities:
+            assert replace(quantity, optional=False) == MAPPINGS["motors"].quantities[name]
+    assert {"rate_commands", "voltage"} == {name for name, one in to_copy.quantities.items() if one.optional}
 
 
 def test_an_unknown_mapping_and_a_vehicle_without_motors_are_errors(tmp_path):
