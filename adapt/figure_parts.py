@@ -2,7 +2,7 @@
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import EngFormatter, FuncFormatter, LogFormatterMathtext, LogLocator, NullFormatter
 
 from adapt.experiment_table import MODES
 from adapt.plot_style import GREY
@@ -11,7 +11,7 @@ from adapt.plot_style import GREY
 BLUE, ORANGE, GREEN, PINK = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 MODE_LOOK = dict(zip(MODES, ((BLUE, "o"), (ORANGE, "s"), (GREEN, "D")), strict=True))
 METHOD_LOOK = {"apg": (BLUE, "o"), "ppo": (ORANGE, "s"), "pets": (GREEN, "D"), "mpc": (GREY, "^")}
-CURRICULUM_LOOK = {"both": (BLUE, "-"), "threshold": (GREEN, "--"), "speed": (PINK, "-."), "none": (ORANGE, ":")}
+CURRICULUM_LOOK = {"both": BLUE, "none": ORANGE, "threshold": GREEN, "speed": PINK}
 BUILD_LOOK = {"compiled": (BLUE, "-"), "eager": (ORANGE, "--")}
 SYSTEM_LOOK = {"quadrotor": (BLUE, "o"), "fixed_wing": (ORANGE, "s")}
 NOTHING = {"low": np.nan, "mean": np.nan, "high": np.nan}
@@ -30,15 +30,18 @@ def panels(count, size, **settings):
 def logarithmic(axis, plain=True):
     """Make an axis logarithmic and label it at 1 and, of few decades, 3 of each, with plain numbers or 10k, 3M.
 
-    To be called when all is drawn; an axis without a number on it has no scale and no ticks.
+    Plain numbers over many decades are powers of ten. To be called when all is drawn; an axis without a number on it has
+    no scale and no ticks.
     """
     if not np.isfinite(axis.get_minpos()):
         axis.set_ticks([])
         return
     axis.axes.set(**{f"{axis.axis_name}scale": "log"})
     low, high = axis.get_view_interval()
-    axis.set_major_locator(LogLocator(subs=(1.0, 3.0) if high / low < MANY else (1.0,)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}") if plain else EngFormatter(sep=""))
+    many = high / low >= MANY
+    axis.set_major_locator(LogLocator(subs=(1.0,) if many else (1.0, 3.0)))
+    written = LogFormatterMathtext() if many else FuncFormatter(lambda value, _: f"{value:g}")
+    axis.set_major_formatter(written if plain else EngFormatter(sep=""))
     axis.set_minor_formatter(NullFormatter())
 
 
@@ -80,6 +83,14 @@ def curve(axes, curves, name, x, colour, column="error", **settings):
         axes.fill_between(found.x, found.low, found.high, color=colour, alpha=0.2, linewidth=0)
         return True
     return False
+
+
+def each_seed(axes, curves, name, x, colour, column="error"):
+    """Draw every seed of a curve by a thin line, and the mean of `over` by a thick one."""
+    for _, seed in curves[curves.experiment == name].groupby("seed"):
+        axes.plot(seed[x], seed[column], color=colour, linewidth=1.2, alpha=0.6)
+    found = over(curves, name, x, column)
+    axes.plot(found.x, found["mean"], color=colour, linewidth=3.2)
 
 
 def mark_failing(axes, curves, name, x, colour):

@@ -30,6 +30,7 @@ from adapt.figure_parts import (
     SYSTEM_LOOK,
     band,
     curve,
+    each_seed,
     legend,
     logarithmic,
     mark_failing,
@@ -43,7 +44,7 @@ from envs.errors import InputError
 from policies.files import replacing
 
 TITLES = {"quadrotor": "quadrotor", "fixed_wing": "fixed wing"}
-CURRICULA = {"both": "threshold and speed", "threshold": "threshold only", "speed": "speed only", "none": "none"}
+CURRICULA = {"both": "threshold and speed", "threshold": "threshold only", "speed": "speed only", "none": "no curriculum"}
 ZERO = 10  # where no transitions stand on a logarithmic axis that begins at 30
 WATCHED = 1000  # transitions after which the fine-tuning is watched
 EXACT = 1e-6  # [m/s^2] what single precision leaves of nothing
@@ -161,16 +162,17 @@ def draw_horizon(evidence):
 
 
 def draw_curriculum(evidence):
-    """Validation error and success over training with and without the curriculum and its parts."""
-    figure = Figure(figsize=(7.5, 6), layout="constrained")
-    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(2.4, 1))
-    for name, (colour, style) in CURRICULUM_LOOK.items():
-        curve(top, evidence.curves, f"curriculum-{name}", "update", colour, linestyle=style, label=CURRICULA[name])
-        curve(bottom, evidence.curves, f"curriculum-{name}", "update", colour, "success", linestyle=style)
-    top.set_ylabel("position error [m]")
-    logarithmic(top.yaxis)
-    bottom.set(ylabel="success", xlabel="updates", ylim=(-0.05, 1.05))
-    legend(top, title="curriculum", ncols=2)
+    """Validation error over training with and without the curriculum and its parts, of each seed and in the mean."""
+    figure = Figure(figsize=(7.5, 6.4), layout="constrained")
+    grid = figure.subplots(2, 2, sharex=True, sharey=True)
+    for axes, (name, colour) in zip(grid.flat, CURRICULUM_LOOK.items(), strict=True):
+        each_seed(axes, evidence.curves, f"curriculum-{name}", "update", colour)
+        mark_failing(axes, evidence.curves, f"curriculum-{name}", "update", colour)
+        axes.set_title(CURRICULA[name], color=colour, fontweight="bold")
+    logarithmic(grid[0, 0].yaxis)
+    for below, beside in zip(grid[1], grid[:, 0], strict=True):
+        below.set_xlabel("updates")
+        beside.set_ylabel("position error [m]")
     return figure
 
 
@@ -208,7 +210,7 @@ def _tuning(axes, evidence, system, colour):
     """The error in the target while the policy is tuned, between the levels of zero-shot and of the model."""
     name = f"drag-apg-{system}-{WATCHED}"
     spent = over(evidence.curves, name, "seconds").x.max()
-    label = TITLES[system] + ("" if np.isnan(spent) else f" (tuned {spent:.0f} s)")
+    label = TITLES[system] + ("" if np.isnan(spent) else f" (takes {spent:.0f} s)")
     axes.plot([], [], color=colour, label=label)
     if curve(axes, evidence.curves, name, "update", colour):
         levels = {":": evidence.spread(name, "zero_shot"), "--": evidence.spread(f"apg-{system}")}
