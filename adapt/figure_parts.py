@@ -30,8 +30,8 @@ def panels(count, size, **settings):
 def logarithmic(axis, plain=True):
     """Make an axis logarithmic and label it at 1 and, of few decades, 3 of each, with plain numbers or 10k, 3M.
 
-    Plain numbers over many decades are powers of ten. To be called when all is drawn; an axis without a number on it has
-    no scale and no ticks.
+    Plain numbers over many decades are powers of ten. To be called when all is drawn; an axis without a number on it
+    has no scale and no ticks.
     """
     if not np.isfinite(axis.get_minpos()):
         axis.set_ticks([])

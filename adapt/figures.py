@@ -44,7 +44,7 @@ from envs.errors import InputError
 from policies.files import replacing
 
 TITLES = {"quadrotor": "quadrotor", "fixed_wing": "fixed wing"}
-CURRICULA = {"both": "threshold and speed", "threshold": "threshold only", "speed": "speed only", "none": "no curriculum"}
+CURRICULA = {"both": "threshold and speed", "threshold": "threshold only", "speed": "speed only", "none": "neither"}
 ZERO = 10  # where no transitions stand on a logarithmic axis that begins at 30
 WATCHED = 1000  # transitions after which the fine-tuning is watched
 EXACT = 1e-6  # [m/s^2] what single precision leaves of nothing

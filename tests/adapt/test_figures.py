@@ -208,3 +208,8 @@ def test_where_most_seeds_fail_a_curve_and_a_band_have_a_gap():
         "horizon", known([("horizon-concurrent-5", (0.1, nan, nan)), ("horizon-concurrent-8", (0.1, 0.1, nan))])
     )[0]
     assert {8: 0.1} in lines(left)
+
+
+def test_the_curriculum_is_shown_by_each_seed_and_in_the_mean():
+    both = lines(drawn("curriculum")[0])
+    assert both[:3] == [{10: 4.0, 20: 1.0}, {10: 2.0, 20: 3.0}, {10: 3.0, 20: 2.0}]
