@@ -1,10 +1,12 @@
 """Actions whose columns, signs or times are wrong are refused, whatever differs in the target; right ones are not."""
 
+import contextlib
 from dataclasses import replace
 
 import pytest
 import torch
 
+from adapt import labelling
 from adapt.flying import collect
 from adapt.labelling import check_labels
 from adapt.transitions import joined
@@ -20,11 +22,11 @@ TARGETS = {
 }
 
 
-def flown(system, target="", samples=200):
+def flown(system, target="", samples=200, seeds=(0, 1)):
     """Transitions of the shipped policy, in two flights, and the source."""
     policy, dynamics = load_policy(system), make_dynamics(system, target)
     parts = []
-    for seed in (0, 1):
+    for seed in seeds:
         episodes, generator = policy.task.episodes(20, "train", seed), torch.Generator().manual_seed(seed)
         flight = (dynamics, policy.task, episodes)
         parts.append(collect(policy.actor(seed), flight, samples // 2, 0.1, generator))
@@ -34,6 +36,23 @@ def flown(system, target="", samples=200):
 @pytest.mark.parametrize(("system", "target"), [(name, target) for name, all_ in TARGETS.items() for target in all_])
 def test_what_was_recorded_rightly_is_taken(system, target):
     assert check_labels(*flown(system, target)) == []
+
+
+def test_the_standard_error_of_a_gain_is_how_far_it_scatters(monkeypatch):
+    """Errors of the same size under both labels: the gain is 0 but for chance."""
+    generator = torch.Generator().manual_seed(0)
+    monkeypatch.setattr(labelling, "_squares", lambda base, data: torch.randn(50, 4, generator=generator).square())
+    gains, doubts = torch.tensor([labelling._gain(None, None, None) for _ in range(400)]).T
+    assert float(gains.std()) == pytest.approx(float(doubts.mean()), rel=0.15)
+    assert gains.mean().abs() < 3 * gains.std() / 400**0.5
+
+
+@pytest.mark.parametrize(("doubt", "refused"), [(0.04, True), (0.08, False)])
+def test_a_gain_that_may_be_chance_refuses_nothing(monkeypatch, doubt, refused):
+    data, source = flown("cartpole", samples=20)
+    monkeypatch.setattr(labelling, "_gain", lambda base, recorded, other: (0.3, doubt))
+    with pytest.raises(InputError) if refused else contextlib.nullcontext():
+        check_labels(data, source)
 
 
 @pytest.mark.parametrize("samples", [10, 200])
