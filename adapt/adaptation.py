@@ -30,7 +30,9 @@ from policies.evaluate import Evaluation, evaluate, test_episodes
 
 PICTURE_ROUNDS = 5
 PARTS = 10  # that `until_known` divides the transitions into
+ELSEWHERE = "the residual predicts flight in the target worse than the model alone; were the transitions flown there?"
 VALIDATIONS = 4  # of the policy that is fine-tuned, in the fitted model
+WORSE, LITTLE = 1.5, 0.01  # [-] times, [m/s^2, rad/s^2] beyond which a residual misleads
 MEMBERS = 3  # fits to resampled flight that the gate asks
 
 
@@ -146,6 +148,8 @@ def adapt(
     if transitions.context is not None:
         context = transitions.context.mean(0) if context is None else torch.as_tensor(context)
     prediction = _prediction(source, residual, fit, unseen, context, transitions.context_names)
+    if recorded and _misleads(prediction):
+        fit = replace(fit, warnings=(*fit.warnings, ELSEWHERE))
     # A copy: what is returned stays on the CPU, where the transitions are.
     learned = copy.deepcopy(_bound(residual, context)).to(device)
     truth = target if target is not None else learned
@@ -226,6 +230,12 @@ def _prediction(source, residual, fit, unseen, context, names):
         unseen = replace(unseen, context=context.expand(len(unseen), -1), context_names=names)
     both = {"model": source, "model + residual": residual}
     return {name: prediction_error(dynamics, unseen) for name, dynamics in both.items()}
+
+
+def _misleads(prediction):
+    """Whether the residual predicts accelerations clearly worse than the model alone."""
+    before, after = prediction["model"], prediction["model + residual"]
+    return any(after[what] > WORSE * before[what] + LITTLE for what in before if what.endswith("acceleration"))
 
 
 def _bound(residual, context):

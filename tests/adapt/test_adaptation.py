@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from adapt import finetuning, rounds
-from adapt.adaptation import adapt
+from adapt.adaptation import ELSEWHERE, adapt
 from adapt.clock import Clock
 from adapt.finetuning import finetune
 from adapt.flying import collect
@@ -154,6 +154,15 @@ def test_recorded_transitions_are_used_as_they_are(rough_cartpole, target):
     result = adapt(rough_cartpole, target, transitions=recorded, samples=9, config=QUICK)
     assert result.transitions is recorded
     assert mean(result, "few_shot") < 0.5 * mean(result, "zero_shot")
+
+
+def test_transitions_that_were_flown_elsewhere_are_noticed(rough_cartpole, target):
+    recorded, config = flown(rough_cartpole, target, 100), replace(QUICK, updates=1)
+    there, elsewhere = (
+        adapt(rough_cartpole, dynamics, transitions=recorded, episodes=3, config=config, gate=False).fit.warnings
+        for dynamics in (target, make_dynamics("cartpole"))
+    )
+    assert ELSEWHERE in elsewhere and ELSEWHERE not in there
 
 
 @pytest.mark.slow
