@@ -151,12 +151,13 @@ def adapt(
     if recorded and _misleads(prediction):
         fit = replace(fit, warnings=(*fit.warnings, ELSEWHERE))
     # A copy: what is returned stays on the CPU, where the transitions are.
-    learned = copy.deepcopy(_bound(residual, context)).to(device)
+    held = _bound(residual, context)
+    learned = copy.deepcopy(held).to(device)
     truth = target if target is not None else learned
     clock.next("finetune")
     judge = watch and Judge(policy, truth, seen, watch, config.updates)
     validations = VALIDATIONS if gate and not pixels else 0
-    noise = sensor_noise(_bound(residual, context), transitions) if validations else ()
+    noise = sensor_noise(held, transitions) if validations else ()
     tuned, history = finetune(begun, learned, config, seed, progress, footage, judge, validations, noise)
     if judge:
         clock.move("finetune", "watch", judge.seconds)

@@ -34,7 +34,7 @@ def finetune(policy, dynamics, config=None, seed=0, progress=None, footage=None,
         judge: called with the network and the number of each update; returns what is added to its metrics.
         validations: how often the network flies validation episodes in the dynamics on the way. What flies best is
             returned, be it the policy as given; without any, what was trained last.
-        noise: of the sensors that it flies these episodes by, see `adapt.sensor_noise`.
+        noise: of the sensors that it flies these episodes by, see `adapt.sensor_noise`; training is without.
 
     Returns:
         the new `Policy` and the metrics of each update, with the `seconds` spent until then without judging.
