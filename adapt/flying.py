@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from adapt.transitions import Transitions
+from adapt.transitions import LARGEST, Transitions
 from envs.errors import InputError
 
 
@@ -14,7 +14,8 @@ def collect(policy, env, n, exploration=0.0, generator=None):
     """Fly a policy in a target until `n` transitions are recorded; no gradient.
 
     Whole trajectories count one after another, the last one as far as it is needed: 1000 are ten flights of 100 steps,
-    30 are the beginning of one. What follows the end of an episode isn't used. A target that is `one_at_a_time`, as a
+    30 are the beginning of one. What follows the end of an episode isn't used, nor
+    what no robot can do (numbers beyond all bounds). A target that is `one_at_a_time`, as a
     plant is, flies the same episodes with the same noise one after another; if it is lost, fewer are recorded. Where a
     target's sensors err, the states are those that were measured, which the policy saw.
 
@@ -102,7 +103,7 @@ def _fly_together(policy, env, episodes, steps, noise, flights):
         now["action"] = (now["action"] + noise(step, flights).to(now["action"])).clamp(-1, 1)
         now = env.step(now)
         rows = tuple(part.cpu() for part in (measured(now), now["action"], measured(now["next"])))
-        flying = flying & torch.cat(rows, -1).isfinite().all(-1)
+        flying = flying & (torch.cat(rows, -1).abs() < LARGEST).all(-1)  # nor nan
         record.append((*rows, flying))
         flying = flying & ~now["next", "done"].squeeze(-1).cpu()
         if not flying.any():

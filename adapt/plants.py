@@ -14,12 +14,11 @@ import numpy as np
 import torch
 
 from adapt.plant_table import SIMULATORS
-from adapt.transitions import DT_TOLERANCE, QUATERNION, QUATERNION_TOLERANCE
+from adapt.transitions import DT_TOLERANCE, LARGEST, QUATERNION, QUATERNION_TOLERANCE
 from envs.errors import InputError
 from policies import METHODS
 
 PATIENCE = 3  # flights in a row that may end before their first step; then a plant is given up
-LARGEST = 1e9  # [SI unit of the state] what no state of a robot exceeds
 FAULTS = 5  # that a report tells in words
 
 

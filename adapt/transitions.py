@@ -19,6 +19,7 @@ from policies.files import replacing
 QUATERNION = ("qw", "qx", "qy", "qz")
 QUATERNION_TOLERANCE = 1e-3  # [-] allowed error of a quaternion's length
 DT_TOLERANCE = 1e-6  # [-] relative
+LARGEST = 1e9  # [SI unit of the state] what no state of a robot exceeds
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,10 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from adapt.flying import collect
-from adapt.transitions import Transitions, check
+from adapt.transitions import LARGEST, Transitions, check
 from envs import make_dynamics, make_env, make_system, make_task
 from envs.errors import InputError
+from policies.checkpoints import load_policy
 
 
 class Trim(torch.nn.Module):
@@ -215,6 +216,14 @@ def test_shapes_that_do_not_fit_are_refused(flights):
 def test_nonsense_is_not_flown(n, exploration):
     with pytest.raises(InputError, match="collect"):
         flown(n=n, exploration=exploration)
+
+
+def test_flight_beyond_all_bounds_is_not_recorded():
+    """With half the inertia about x the rate control is unstable, and numbers grow until the quaternion is 0."""
+    policy, target = load_policy("quadrotor"), make_dynamics("quadrotor", "inertia_x=x0.5379 inertia_y=x1.15")
+    recorded = collect(policy.actor(), (target, policy.task, policy.task.episodes(20, "train", 0)), 100)
+    assert recorded.next_state.abs().max() < LARGEST
+    check(recorded, policy.task.system)
 
 
 def test_joined_parts_keep_their_trajectories_apart():
