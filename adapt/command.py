@@ -282,7 +282,8 @@ def environment(seed, threads):
     from importlib.metadata import version
 
     # The hash alone, even on a tag; "-dirty" where files differ from the commit.
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude", "*"]
+    git = ["git", "--no-optional-locks", "-C", str(Path(__file__).parent)]  # nothing is written to the repository
+    command = [*git, "describe", "--always", "--dirty", "--exclude", "*"]
     try:
         commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
     except OSError:  # no git, no commit
