@@ -161,17 +161,17 @@ def adapt(
     tuned, history = finetune(begun, learned, config, seed, progress, footage, judge, validations, noise)
     if judge:
         clock.move("finetune", "watch", judge.seconds)
-    chosen, verdict = tuned, None
+    chosen, verdict, changed = tuned, None, not same_weights(policy, tuned)
     if gate:
         clock.next("gate")
         chosen, verdict = policy, nothing_found(noise)
-        if not same_weights(policy, tuned):
+        if changed:
             models = {"the fit": learned} | _alternatives(policy, transitions, source, fit, context, seed, device)
             chosen, verdict = Gate(policy, models, seen, seed, noise=noise).choose(tuned)
     keep("policy", chosen)
     clock.next("evaluate")
     flown = {"zero_shot": policy, "few_shot": chosen}
-    if chosen is policy and not same_weights(policy, tuned) and plant is None:  # no plant is risked for it
+    if chosen is policy and changed and plant is None:  # no plant is risked for it
         flown["refused"] = tuned
     evaluations |= _evaluated(flown, truth, seen, tests, seed)
     best = None

@@ -81,7 +81,8 @@ def main(options):
     rows = audit_report.numbers(table[table.seed == str(options.seed)])
     if rows.empty:
         known = f", only of {', '.join(sorted(set(table.seed)))}" if len(table) else ""
-        raise InputError(f"{folder / TABLE}: there are no cases of --seed {options.seed}{known}; leave out --summary")
+        none = f"there are no cases of --seed {options.seed}{known}"
+        raise InputError(f"{folder / TABLE}: {none}; leave out --summary to make some")
     print(audit_report.table(rows))
     audit_report.save(rows, folder / PICTURE)
     print(f"cases in {folder / TABLE}, picture in {folder / PICTURE}")

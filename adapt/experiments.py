@@ -268,8 +268,10 @@ def _status(options):
         note = "for a cluster" if cluster else ""
         rows.append((name, f"{len(done)} of {len(runs)}", len(old) or "", minutes and f"{minutes:.1f}", note))
     print(_tabulated(rows, ("experiment", "done", "with other settings", "minutes a seed", "")))
-    timed = [] if untimed and not left else [f"about {left:.0f} minutes of one core"]
-    print(f"left: {' and '.join(timed + [f'{untimed} runs that have never been timed'] * bool(untimed))}")
+    said = [f"about {left:.0f} minutes of one core"] if left or not untimed else []
+    if untimed:
+        said.append(f"{untimed} runs that have never been timed")
+    print(f"left: {' and '.join(said)}")
 
 
 def _gather(options):

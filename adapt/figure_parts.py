@@ -75,9 +75,9 @@ def over(curves, name, x, column="error"):
     return found
 
 
-def curve(axes, curves, name, x, colour, column="error", **settings):
+def curve(axes, curves, name, x, colour, **settings):
     """Draw `over`; returns whether there was anything to draw."""
-    found = over(curves, name, x, column)
+    found = over(curves, name, x)
     if found["mean"].notna().any() and found.x.notna().any():
         axes.plot(found.x, found["mean"], color=colour, **settings)
         axes.fill_between(found.x, found.low, found.high, color=colour, alpha=0.2, linewidth=0)
@@ -85,11 +85,11 @@ def curve(axes, curves, name, x, colour, column="error", **settings):
     return False
 
 
-def each_seed(axes, curves, name, x, colour, column="error"):
+def each_seed(axes, curves, name, x, colour):
     """Draw every seed of a curve by a thin line, and the mean of `over` by a thick one."""
     for _, seed in curves[curves.experiment == name].groupby("seed"):
-        axes.plot(seed[x], seed[column], color=colour, linewidth=1.2, alpha=0.6)
-    found = over(curves, name, x, column)
+        axes.plot(seed[x], seed.error, color=colour, linewidth=1.2, alpha=0.6)
+    found = over(curves, name, x)
     axes.plot(found.x, found["mean"], color=colour, linewidth=3.2)
 
 

@@ -14,10 +14,10 @@ def collect(policy, env, n, exploration=0.0, generator=None):
     """Fly a policy in a target until `n` transitions are recorded; no gradient.
 
     Whole trajectories count one after another, the last one as far as it is needed: 1000 are ten flights of 100 steps,
-    30 are the beginning of one. What follows the end of an episode isn't used, nor
-    what no robot can do (numbers beyond all bounds). A target that is `one_at_a_time`, as a
-    plant is, flies the same episodes with the same noise one after another; if it is lost, fewer are recorded. Where a
-    target's sensors err, the states are those that were measured, which the policy saw.
+    30 are the beginning of one. What follows the end of an episode isn't used, nor what no robot can do (numbers
+    beyond all bounds). A target that is `one_at_a_time`, as a plant is, flies the same episodes with the same noise one
+    after another; if it is lost, fewer are recorded. Where a target's sensors err, the states are those that were
+    measured, which the policy saw.
 
     Args:
         policy: TensorDict module that reads `observation` and `window` and writes `action`.

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from adapt.trust_region import FARTHEST, NOISY, SHARES, distance, part_way
-from envs.dynamics import Sensed
+from adapt.trust_region import FARTHEST, SHARES, distance, episode_count, part_way, sensed
 from policies.compiled_dynamics import fastest
 from policies.evaluate import evaluate, test_episodes
 
@@ -79,7 +78,7 @@ NOTHING_FOUND = "fine-tuning found nothing that flies better in the fitted model
 BY_SENSORS = ", by sensors that err as those did that recorded the flight"
 
 
-def nothing_found(noise=()):
+def nothing_found(noise):
     """The `Verdict` where fine-tuning, validated by sensors with such noise, left the policy as it was."""
     return Verdict(False, NOTHING_FOUND + (BY_SENSORS if noise else ""), 0.0, 0.0, {}, distance=0.0)
 
@@ -89,7 +88,7 @@ class Gate:
 
     Args:
         task: as it is seen in the target, whose validation episodes are flown.
-        episodes: flown in each model, `NOISY` times as many by noisy sensors.
+        episodes: flown in each model, more by noisy sensors (`episode_count`).
         noise: of the sensors that both fly by, see `adapt.sensor_noise`.
     """
 
@@ -98,8 +97,8 @@ class Gate:
         device = next(old.network.parameters()).device
         compiled = device.type == "cpu"
         quick = {name: fastest(dynamics)[0] if compiled else dynamics for name, dynamics in models.items()}
-        self.models = {name: Sensed(dynamics, noise) if noise else dynamics for name, dynamics in quick.items()}
-        count = NOISY * episodes if noise else episodes
+        self.models = {name: sensed(dynamics, noise) for name, dynamics in quick.items()}
+        count = episode_count(episodes, noise)
         self.episodes = test_episodes(self.task, count, "validation", APART + seed).to(device)
         self.before = {name: self._fly(old, name) for name in models}
 

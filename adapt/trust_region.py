@@ -14,6 +14,16 @@ FARTHEST = 1.0  # [-] root mean square change of the actions, which span -1 to 1
 SHARES = (1.0, 0.5, 0.25)  # of the way that are tried, as a line search does
 
 
+def sensed(dynamics, noise):
+    """The dynamics as sensors with that noise tell of them; themselves where there is none."""
+    return Sensed(dynamics, noise) if noise else dynamics
+
+
+def episode_count(episodes, noise):
+    """How many validation episodes to fly by sensors with that noise where exact ones take so many."""
+    return NOISY * episodes if noise else episodes
+
+
 class Best:
     """Keeps the weights that fly best over validation episodes, from those of the policy as given.
 
@@ -25,8 +35,8 @@ class Best:
 
     def __init__(self, policy, dynamics, updates, times, episodes=16, noise=()):
         self.policy, self.every, self.last = policy, max(1, updates // times), updates
-        self.dynamics = Sensed(dynamics, noise) if noise else dynamics
-        count = NOISY * episodes if noise else episodes
+        self.dynamics = sensed(dynamics, noise)
+        count = episode_count(episodes, noise)
         self.episodes = test_episodes(policy.task, count, "validation", seed=1)  # others than the gate's
         self.update, self.score = 0, None
         self(policy.network, 0)
