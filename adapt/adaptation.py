@@ -139,7 +139,7 @@ def adapt(
     keep("transitions", transitions)
     check_flown(target, transitions)
     notes = []
-    if until_known and not recorded and len(transitions) < samples:
+    if until_known and not recorded and len(transitions) < samples and not getattr(target, "lost", False):
         notes.append(f"stopped flying after {len(transitions)} of {samples} transitions: more would tell no more")
     transitions = _mended(transitions, source, notes, keep)
     clock.next("fit")
@@ -213,7 +213,8 @@ def _fitted(transitions, source, kind, seed, recorded, notes):
     """
     residual, fit = residuals.fit_residual(transitions, source, kind, seed)
     if recorded and not fit.solved and len(newest := still_true(transitions, source, seed)) < len(transitions):
-        notes.append(f"older flight contradicts newer: learned from the last {len(newest)} of {len(transitions)} alone")
+        kept = f"the last {len(newest)} of {len(transitions)} alone, as they were given"
+        notes.append(f"older flight contradicts newer: learned from {kept}")
         transitions = newest
         residual, fit = residuals.fit_residual(transitions, source, kind, seed)
     return transitions, residual, replace(fit, warnings=(*notes, *fit.warnings))

@@ -40,7 +40,8 @@ COLUMNS = (
     *("threads", "python", "torch", "torchrl", "tensordict", "casadi", "commit"),
 )
 KEY = ("system", "index", "seed")
-WORSE = 1.05  # new over old error beyond which a policy got worse
+WORSE, BETTER = 1.05, 0.95  # new over old error beyond which a policy got worse or better
+FEWER = 0.02  # share of flights that may fail more, or fewer, before a policy counts as worse, or better, for it
 
 
 @dataclass(frozen=True)

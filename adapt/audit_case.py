@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 
 from adapt.adaptation import adapt
+from adapt.audit import FEWER
 from adapt.audit_targets import draw
 from adapt.command import environment
 from adapt.flying import collect
@@ -18,7 +19,6 @@ from policies.checkpoints import load_policy
 from policies.evaluate import evaluate, test_episodes
 
 EXPLORATION = 0.1  # standard deviation of noise on the actions flown for data, as `adapt` has it
-FEWER = 0.02  # share of flights that may fail more before a policy counts as worse for it
 SPENT = ("seconds", "cpu_seconds")
 STAGES = ("fit", "finetune", "gate")
 TOLD = {"few_shot": "gated", "zero_shot": "zero_shot", "source": "source", "oracle": "oracle"}

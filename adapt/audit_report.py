@@ -6,11 +6,11 @@ import pandas as pd
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
+from adapt.audit import BETTER, FEWER, WORSE
 from adapt.figure_parts import BLUE, ORANGE, panels
 from adapt.plot_style import DPI, GREY, STYLE
 from policies.files import whole
 
-WORSE, BETTER = 1.05, 0.95  # new over old error beyond which a policy got worse or better
 NOTICED = 1.2  # times the error in the model that a target must cost before the gap to it means anything
 SPAN = (0.01, 4.0)  # of the ratios that are drawn; beyond stands for all and none
 BOTH = {"ratio": ("with the gate", BLUE, "-"), "ratio_ungated": ("without", ORANGE, "--")}
@@ -62,7 +62,7 @@ def figures(rows):
     for column, (name, *_) in BOTH.items():
         ratio = rows[column]
         found[f"worse, {name}"] = f"{_percent(ratio > WORSE)} ({int((ratio > WORSE).sum())})"
-        found[f"better, {name}"] = _percent(ratio < BETTER)
+        found[f"better, {name}"] = _percent(_better(rows, column))
         found[f"ratio, {name}: median"] = f"{_quantile(ratio, 0.5):.3f}"
         found[f"ratio, {name}: 95 % quantile"] = f"{_quantile(ratio, 0.95):.3f}"
     found["success: old, gated, ungated"] = ", ".join(
@@ -77,6 +77,12 @@ def figures(rows):
     return found
 
 
+def _better(rows, column):
+    """Which cases got better: fewer flights fail, or errors are smaller and no more flights fail."""
+    success = rows["gated_success" if column == "ratio" else "ungated_success"]
+    return (rows[column] < BETTER) | (success - rows.zero_shot_success > FEWER)
+
+
 def _percent(which):
     return f"{which.mean():.1%}"
 
@@ -87,7 +93,7 @@ def _quantile(ratio, share):
 
 
 def gap(rows, name):
-    """Share of what a target costs that a policy wins back, NaN where it costs little or no flight can be compared.
+    """Share of what a target costs that a policy wins back, NaN where it costs little or policies fly other episodes.
 
     Without an oracle nothing says what measurement noise costs for good, so noisy targets are left out.
     """
@@ -95,6 +101,8 @@ def gap(rows, name):
     bound = rows[f"{column}_error"]
     cost = rows.zero_shot_error - bound
     told = (cost > (NOTICED - 1) * bound) & ((rows.noise.fillna(0) == 0) | (column == "oracle"))
+    for other in (name, column):  # each error is that of the episodes that the policy flies
+        told &= rows[f"{other}_success"] == rows.zero_shot_success
     return ((rows.zero_shot_error - rows[f"{name}_error"]) / cost).where(told)
 
 

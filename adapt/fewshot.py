@@ -53,8 +53,8 @@ class Options:
     """Family of episodes (quadrotor: paper, fast, circle, lemniscate, line, hover, or a CSV of waypoints)."""
     residual: str = "auto"
     """Kind of residual: parameters (refit those of the model and add drag and push; finds them in noisy states, too),
-    linear, features (random Fourier), network, acceleration (linear and network), state as in the paper, or auto,
-    which takes the one that predicts held-out flight best, the simplest of equals."""
+    linear, features (random Fourier), network, linear+network, state as in the paper, or auto, which takes the one
+    that predicts held-out flight best, the simplest of equals."""
     ungated: bool = False
     """Take the new policy even where the data leave open whether it is better than the old one."""
     exploration: float = 0.1
@@ -80,7 +80,7 @@ class Options:
     vehicle: str | None = None
     """Parameters of your own robot: a shipped name, crazyflie (a quadrotor) or j3cub (a fixed wing), or a TOML file."""
     log: Repeatable = ()
-    """Learn from a flight log of a quadrotor (CSV, PX4 .ulg, ROS bag); may be repeated."""
+    """Learn from a flight log of a quadrotor (CSV, PX4 .ulg, ROS bag); may be repeated, the oldest flight first."""
     validate: Repeatable = ()
     """Flight logs to report the prediction error on; may be repeated."""
     mapping: str = "auto"
@@ -145,6 +145,8 @@ def _check(options):
     if options.validate and not options.log:
         raise InputError("--validate: needs --log to learn from")
     learned = {Path(path).resolve() for path in options.log}
+    if len(learned) < len(options.log):
+        raise InputError("--log: names a file twice; give each flight once")
     if both := [path for path in options.validate if Path(path).resolve() in learned]:
         raise InputError(f"--validate {both[0]}: is learned from with --log; give flights that are not")
     if options.pixels and (options.log or options.transitions):

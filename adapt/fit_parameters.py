@@ -199,7 +199,7 @@ def settle(loss, names, start):
             return None
         if not left.isfinite().all() or not effects.isfinite().all():
             return None
-        errors = _standard_errors(left, effects) * sizes
+        errors = _standard_errors(loss, left, effects) * sizes
         if not names:
             break
         change = torch.linalg.lstsq(effects, left[:, None]).solution[:, 0]
@@ -221,9 +221,9 @@ def _physical(base, values):
     return True
 
 
-def _standard_errors(left, effects):
+def _standard_errors(loss, left, effects):
     """One standard deviation of each parameter in its size, if what is left is independent noise."""
     if not effects.shape[1]:
         return torch.zeros(0, dtype=torch.float64)
-    variance = left.square().sum() / max(1, len(left) - effects.shape[1])
+    variance = loss.repeated * left.square().sum() / max(1, len(left) - loss.spent - effects.shape[1])
     return (torch.linalg.pinv(effects.T @ effects).diagonal().clamp(min=0) * variance).sqrt()

@@ -75,7 +75,7 @@ class Verdict:
 
 
 NOTHING_FOUND = "fine-tuning found nothing that flies better in the fitted model"
-BY_SENSORS = ", by sensors that err as those did that recorded the flight"
+BY_SENSORS = ", by sensors that err as much as the recorded states jump"
 
 
 def nothing_found(noise):

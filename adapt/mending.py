@@ -4,6 +4,8 @@ What is recorded goes through many hands. A fit is sure of itself where rows are
 are shuffled; and flight from before a change of the robot contradicts what came after it.
 """
 
+from itertools import pairwise
+
 import torch
 
 from adapt.choose_residual import MOTION, HeldOut
@@ -20,9 +22,11 @@ CONTRADICTS = 2.0  # times the error that newer flight leaves of itself, beyond 
 
 
 def mended(transitions):
-    """The transitions without repeated rows, each flight in order of time; and notes on what was done, as sentences."""
-    rows = torch.cat((transitions.state, transitions.action, transitions.next_state), -1)
-    keys = list(zip(transitions.trajectory.tolist(), _keys(rows), strict=True))
+    """The transitions without repeated rows, each flight in order of time; and notes on what was done, as sentences.
+
+    A row of another flight is repeated, too, so that a log that is given twice counts once.
+    """
+    keys = _keys(torch.cat((transitions.state, transitions.action, transitions.next_state), -1))
     first = {}
     for number, key in enumerate(keys):
         first.setdefault(key, number)
@@ -42,22 +46,45 @@ def _keys(rows):
 
 
 def _in_time(transitions):
-    """The order of rows in which each follows the one whose end it begins with, where there is one."""
+    """The order of rows in which each follows the one whose end it begins with, where there is one.
+
+    Flights come as they stand; by their numbers where rows of one are among those of another.
+    """
     flights = transitions.trajectory.tolist()
-    begins = {}
-    for number, key in enumerate(zip(flights, _keys(transitions.state), strict=True)):
-        begins.setdefault(key, number)
-    following = [begins.get(key) for key in zip(flights, _keys(transitions.next_state), strict=True)]
-    followers = {after for after in following if after is not None}
-    starts = [number for number in range(len(following)) if number not in followers]
+    following = _followers(transitions)
+    followers = set(following.values())
+    starts = [number for number in range(len(flights)) if number not in followers]
     order, seen = [], set()
-    for start in (*starts, *range(len(following))):  # circles have no start
+    for start in (*starts, *range(len(flights))):  # circles have no start
         while start is not None and start not in seen:
             seen.add(start)
             order.append(start)
-            start = following[start]
-    position = {flight: place for place, flight in enumerate(dict.fromkeys(flights))}
+            start = following.get(start)
+    named = list(dict.fromkeys(flights))
+    mixed = sum(one != other for one, other in pairwise(flights)) >= len(named)
+    position = {flight: place for place, flight in enumerate(sorted(named) if mixed else named)}
     return sorted(order, key=lambda number: position[flights[number]])
+
+
+def _followers(transitions):
+    """{row: the one that follows it in its flight}: the next row if it does, else the first of those that are left.
+
+    A robot may come to the same state again, at rest above all, so that several rows begin where one ends.
+    """
+    flights = transitions.trajectory.tolist()
+    begins, ends = (
+        list(zip(flights, _keys(states), strict=True)) for states in (transitions.state, transitions.next_state)
+    )
+    count = len(flights)
+    following = {number: number + 1 for number in range(count - 1) if ends[number] == begins[number + 1]}
+    left = {}
+    for number in sorted(set(range(count)) - set(following.values())):
+        left.setdefault(begins[number], []).append(number)
+    for number in range(count):
+        if number not in following and (found := [one for one in left.get(ends[number], ()) if one != number]):
+            following[number] = found[0]
+            left[ends[number]].remove(found[0])
+    return following
 
 
 def still_true(transitions, base, seed=0):

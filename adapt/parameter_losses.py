@@ -51,6 +51,7 @@ class OneStep:
     """Accelerations over one control period. Residuals are in rows of transitions, outputs side by side."""
 
     noise = None  # none is estimated
+    spent, repeated = 0, 1.0  # residuals that estimated states take up, and how often each transition is counted
 
     def __init__(self, base, data):
         self.base, self.data = base, data
@@ -84,6 +85,8 @@ class Shooting:
         self.start = self.flown.measured[:, 0]
         self.noise = None  # (d,) of the measured states, in the tangent space
         self.folds = blocks(self.flown.trajectory)
+        self.spent = difference(base.system, self.start, self.start).numel()
+        self.repeated = self.flown.repeated
 
     @torch.no_grad()
     def linearised(self, values, names):

@@ -97,9 +97,9 @@ class Flights:
         return following
 
     def report(self):
-        """Flights, steps, broken flights and the first faults, for `metrics.json`."""
+        """Flights, steps, broken flights, the first faults and the last, for `metrics.json`."""
         broken = {"flights": self.count, "steps": self.steps, "broken": len(self.faults), "given up": self.lost}
-        return {"name": self.name, **broken, "faults": self.faults[:FAULTS]}
+        return {"name": self.name, **broken, "faults": self.faults[:FAULTS] + self.faults[FAULTS:][-1:]}
 
     def _answer(self, state, method, *arguments):
         try:

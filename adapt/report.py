@@ -85,7 +85,7 @@ def notes(metrics):
 def _broken_flights(plant):
     if not plant or not plant["broken"]:
         return []
-    lost = "; then it was given up" if plant["given up"] else ""
+    lost = f"; then it was given up ({plant['faults'][-1]})" if plant["given up"] else ""
     return [f"{plant['broken']} of {plant['flights']} flights of the plant broke off ({plant['faults'][0]}){lost}"]
 
 

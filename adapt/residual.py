@@ -1,7 +1,8 @@
 """Fit a residual to transitions, and say how much better it predicts.
 
-The default residual is a sparse linear acceleration, chosen by cross-validation (see `sparse_ridge`), and a small
-network that learns what the linear part leaves and stays only where it improves held-out transitions.
+By default the kind is chosen by the flight that it predicts (see `choose_residual`): refitted parameters of the model,
+a sparse linear acceleration (see `sparse_ridge`), random features or a network, which stay only where they improve
+held-out transitions, or the paper's network added to the whole next state.
 """
 
 import time

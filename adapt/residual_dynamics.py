@@ -1,8 +1,8 @@
 """Dynamics f + Δφ that can stand wherever f did: the model, not how it is fitted.
 
 Wiedemann, Wuest et al. (2023), sect. IV-D, add a network to the whole next state: kind "state" here. Kinematics are
-exact, though, so what is missing is a force or a torque: the default kind "acceleration" learns that, and position,
-velocity and attitude follow through the integrator. Both are exactly zero until they are fitted.
+exact, though, so what is missing is a force or a torque: form "acceleration" learns that, and position, velocity
+and attitude follow through the integrator. Both are exactly zero until they are fitted.
 """
 
 import copy

@@ -91,7 +91,7 @@ def held_out(policy, target, task, episodes, seed):
 def check_flown(target, transitions):
     """Refuse what a plant flew before it was given up where that is too little to learn from."""
     if getattr(target, "lost", False) and len(transitions) < residuals.MINIMUM:
-        flown, why = f"{len(transitions)} transitions", target.faults[0]
+        flown, why = f"{len(transitions)} transitions", target.faults[-1]
         raise InputError(f"{target.name}: was given up after {flown} ({why}); at least {residuals.MINIMUM} are needed")
 
 

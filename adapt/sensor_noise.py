@@ -15,6 +15,7 @@ def sensor_noise(dynamics, transitions):
     From stretches of flight that the dynamics predict from an estimated first state. What they don't know of the robot
     makes the prediction stray smoothly, while noise jumps from one control period to the next: it is told by second
     differences of what is left (Gasser et al. 1986, Residual variance and residual pattern in nonlinear regression).
+    An effect of the actions that the dynamics can't express, such as a lag, jumps as noise does and is counted as such.
     Nothing where states are exact, or no stretch is long enough to tell.
     """
     data = transitions.double()

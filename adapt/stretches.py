@@ -16,6 +16,7 @@ class Stretches:
     action: torch.Tensor  # (M, T, m)
     trajectory: torch.Tensor  # (M,) flight that each is of
     context: torch.Tensor | None = None  # (M, c) at its beginning
+    repeated: float = 1.0  # [-] how often a transition stands in them, on average
 
     def seen_by(self, dynamics):
         """The dynamics with the context that each stretch begins with, if they take any."""
@@ -35,24 +36,31 @@ class Stretches:
 
 
 def cut(data, length):
-    """Flights cut into stretches of `length` control periods, or of the longest that there is.
+    """Flights cut into stretches of `length` control periods, or of fewer where most flights are shorter.
 
-    The last stretch of a flight overlaps the one before it, so that nothing is left out.
+    What a stretch tells about an acceleration grows with the cube of its length: the length is taken that tells most in
+    all, and flights that are shorter are left out. The last stretch of a flight overlaps the one before it, so that
+    nothing of it is.
 
     Raises:
         ValueError: no flight is as long as the shortest stretch.
     """
     unbroken = chains(data)
-    length = min(length, max((last - first for first, last in unbroken), default=0))
-    if length < SHORTEST:
-        raise ValueError(f"flights of {length} transitions without a gap, expected {SHORTEST}")
+    longest = max((last - first for first, last in unbroken), default=0)
+    if longest < SHORTEST:
+        raise ValueError(f"flights of {longest} transitions without a gap, expected {SHORTEST}")
+    covered = {
+        tried: sum(last - first for first, last in unbroken if last - first >= tried)
+        for tried in range(min(length, longest), SHORTEST - 1, -1)
+    }
+    length = max(covered, key=lambda tried: covered[tried] * tried**2)  # of equals the longest
     long = [(first, last) for first, last in unbroken if last - first >= length]
     starts = [min(start, last - length) for first, last in long for start in range(first, last, length)]
     rows = torch.tensor(starts)[:, None] + torch.arange(length)
     first = rows[:, 0]
     measured = torch.cat((data.state[rows], data.next_state[rows[:, -1:]]), 1)
     context = None if data.context is None else data.context[first]
-    return Stretches(measured, data.action[rows], data.trajectory[first], context)
+    return Stretches(measured, data.action[rows], data.trajectory[first], context, rows.numel() / covered[length])
 
 
 def chains(data):

@@ -16,6 +16,8 @@ def rows(ratios, ungated=None, system="quadrotor", **changes):
     made["system"], made["index"] = system, [str(i) for i in range(len(ratios))]
     made["ratio"], made["ratio_ungated"] = ([str(r) for r in part] for part in (ratios, ungated or ratios))
     made["accepted"], made["episodes"] = "True", "20"
+    for policy in ("source", "zero_shot", "gated", "ungated", "oracle"):
+        made[f"{policy}_success"] = "1.0"
     for name, values in changes.items():
         made[name] = [str(value) for value in values]
     return numbers(made)
@@ -26,6 +28,12 @@ def test_worse_are_those_above_five_percent_and_those_that_fail_more():
     assert found["worse, with the gate"] == "50.0% (2)"
     assert found["worse, without"] == "25.0% (1)"
     assert found["better, with the gate"] == "25.0%"
+
+
+def test_better_are_those_that_save_flights_too():
+    found = figures(rows([1.0, 1.0, 0.9], zero_shot_success=[0.5, 1, 1], gated_success=[1, 1, 1]))
+    assert found["better, with the gate"] == "66.7%"
+    assert found["better, without"] == "66.7%"
 
 
 def test_quantiles_count_infinite_ratios_among_the_cases():
@@ -46,6 +54,11 @@ def test_the_gap_is_what_was_won_back_of_what_the_target_costs():
     assert closed[0] == pytest.approx(0.75)
     assert math.isnan(closed[1]), "a target that costs a tenth leaves nothing to measure"
     assert math.isnan(closed[2]), "no flight to compare"
+
+
+def test_there_is_no_gap_between_errors_of_other_flights():
+    errors = {"source_error": [1], "zero_shot_error": [5], "gated_error": [6], "zero_shot_success": [0.25]}
+    assert math.isnan(gap(rows([1.0], **errors), "gated")[0])
 
 
 def test_an_oracle_takes_the_place_of_the_error_in_the_model():

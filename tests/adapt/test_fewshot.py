@@ -289,6 +289,13 @@ def test_validation_flights_must_be_others_than_those_learned_from(refused, quic
     assert not (tmp_path / "run").exists()
 
 
+def test_a_log_is_given_once(refused, quick, tmp_path):
+    log = hover_log(tmp_path / "a.csv", 3)
+    line = refused("fewshot", *quick, "--vehicle", "crazyflie", "--log", log, "--log", log, "--out", tmp_path / "run")
+    assert "--log: names a file twice" in line
+    assert not (tmp_path / "run").exists()
+
+
 def test_validation_flights_that_are_too_short_are_told_before_the_work(refused, tmp_path, monkeypatch):
     monkeypatch.setattr("adapt.adaptation.adapt", ctrl_c)
     log, short = hover_log(tmp_path / "a.csv", 4), hover_log(tmp_path / "b.csv", 1)

@@ -47,6 +47,30 @@ def test_flights_come_in_the_order_in_which_they_were_recorded(data):
     assert found.trajectory.unique_consecutive().tolist() == data.trajectory.unique_consecutive().flip(0).tolist()
 
 
+def test_a_flight_that_is_given_twice_counts_once(data):
+    found, notes = mended(joined((data, data)))
+    assert same(found, data)
+    assert notes == ["250 of 500 transitions were repeated rows, and left out"]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_flights_whose_rows_are_mixed_come_in_the_order_of_their_numbers(data, seed):
+    found, _ = mended(data.select(torch.randperm(len(data), generator=torch.Generator().manual_seed(seed))))
+    assert same(found, data)
+
+
+@pytest.mark.parametrize("places", ["ABACDE", "AAABCD", "ABBBCB", "ABABAC"])
+def test_rows_in_order_stay_so_where_a_robot_comes_to_the_same_place_again(data, places):
+    """Each action is another one, so that no row is repeated."""
+    rows = data.select(slice(0, len(places) - 1))
+    states = {place: data.state[number] for number, place in enumerate("ABCDE")}
+    visits = torch.stack([states[place] for place in places])
+    rows.state[:], rows.next_state[:] = visits[:-1], visits[1:]
+    found, notes = mended(rows)
+    assert same(found, rows)
+    assert notes == []
+
+
 def test_a_flight_in_a_circle_is_kept_whole():
     data = flown("", 12)
     ring = torch.cat((data.state[1:], data.state[:1]))

@@ -85,11 +85,22 @@ def test_a_drag_is_found_through_noise():
 
 
 @pytest.mark.slow
-def test_the_standard_errors_are_those_of_many_repetitions():
-    base, exact = Dynamics(make_system("quadrotor")), flown("quadrotor", "drag=0.3", 100)
-    found = [search(base, measured(exact, seed), ("drag",)) for seed in range(10)]
+@pytest.mark.parametrize("length", [99, 11])  # [control periods] of a flight; those of 11 make two stretches of 10
+def test_the_standard_errors_are_those_of_many_repetitions(length):
+    base, exact = Dynamics(make_system("quadrotor")), flown("quadrotor", "drag=0.3", 99)
+    exact.trajectory[:] = torch.arange(99) // length
+    found = [search(base, measured(exact, seed), ("drag",)) for seed in range(20)]
     misses = torch.tensor([(one.values["drag"] - 0.3) / one.errors["drag"] for one in found])
-    assert 0.4 < misses.square().mean() < 2.5
+    assert 0.5 < misses.square().mean() < 1.6
+
+
+def test_what_is_counted_twice_makes_no_parameter_surer():
+    """A flight of 11 gives two stretches that share nine of ten transitions."""
+    base, data = Dynamics(make_system("quadrotor")), flown("quadrotor", "drag=0.3", 88, noise=0)
+    data.trajectory[:] = torch.arange(88) // 11
+    shorter = data.select(torch.arange(88) % 11 < 10)
+    doubts = [search(base, part, ("drag",)).errors["drag"] for part in (data, shorter)]
+    assert 0.8 < doubts[0] / doubts[1] < 1.1
 
 
 def hovering(n=40):
@@ -288,7 +299,7 @@ def test_wrong_parameters_are_refused(kind, parameters, words):
 class Drifting:
     """A loss that asks, wherever it is, for the same step of a parameter once more."""
 
-    noise = None
+    noise, spent, repeated = None, 0, 1.0
 
     def __init__(self, base, step):
         self.base, self.step = base, step

@@ -204,7 +204,7 @@ def test_too_few_transitions_of_a_plant_that_dies_are_kept_and_the_reason_is_tol
     kept = []
     with pytest.raises(
         InputError,
-        match=r"plant: was given up after 4 transitions \(flight 1, step 5: OSError: gone\); at least 10 are",
+        match=r"plant: was given up after 4 transitions \(flight \d, step 0: OSError: gone\); at least 10 are",
     ):
         plant = as_plant(policy, target, breaks=dies)
         adapt(policy, plant=plant, samples=90, config=QUICK, keep=lambda *result: kept.append(result), **more)
@@ -221,6 +221,17 @@ def test_rounds_survive_a_flight_that_breaks(policy, target, fault, more):
     assert result.transitions.next_state.isfinite().all()
     assert (result.flights["broken"], result.flights["given up"]) == (1, False)
     assert re.search(words, result.flights["faults"][0])
+
+
+def test_a_plant_that_dies_is_not_said_to_have_nothing_more_to_tell(policy, target):
+    def tires(flight, step):
+        return raised(OSError("glitch" if flight == 1 else "battery empty")) if flight > 4 or step == 9 else None
+
+    plant = as_plant(policy, target, breaks=tires)
+    result = adapt(policy, plant=plant, samples=200, episodes=2, config=QUICK, until_known=True)
+    assert result.flights["given up"]
+    assert [warning for warning in result.fit.warnings if "more would tell no more" in warning] == []
+    assert "glitch" in result.flights["faults"][0] and "battery empty" in result.flights["faults"][-1]
 
 
 def test_a_plant_that_never_flies_is_refused_with_the_reason(policy, target):
@@ -350,7 +361,7 @@ def test_the_command_ends_well_and_draws_what_there_is_where_a_plant_dies(bridge
     assert answer.status == 0, answer
     assert answer.errors == []
     assert "flights of the plant broke off (flight" in answer.out
-    assert "OSError: link lost); then it was given up" in answer.out
+    assert re.search(r"OSError: link lost\); then it was given up \(flight .*: OSError: link lost\)", answer.out)
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["plant"]["given up"]
     assert 10 <= metrics["samples"] <= 45

@@ -1,8 +1,9 @@
 """What the residual is worth on real Crazyflie flights; skipped where the flight data are not at hand.
 
-`pytest tests/adapt/test_real_flights.py -s` prints the figures.
+`NANOBENCH=folder pytest tests/adapt/test_real_flights.py -s` prints the figures; the folder holds the data set's CSVs.
 """
 
+import os
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from adapt.residual import fit_residual
 from envs.dynamics import Dynamics
 from envs.vehicles import load_vehicle
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "nanobench"
+DATA = Path(os.environ.get("NANOBENCH") or Path(__file__).resolve().parents[3] / "shared" / "data" / "nanobench")
 FIT = ("B2_circle_slow_rep1", "B2_circle_slow_rep2", "B3_figure8_medium_rep1", "B3_figure8_medium_rep2")
 VALIDATE = ("B7_oval_medium_rep1", "B9_trefoil_slow_rep1")
 PENALTIES = [10.0**k for k in range(-6, 3)]

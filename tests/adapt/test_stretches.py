@@ -25,6 +25,19 @@ def test_flights_are_cut_into_stretches_that_cover_them():
     assert set(cuts.trajectory.tolist()) == set(data.trajectory.tolist())
 
 
+def test_stretches_tell_how_often_a_transition_stands_in_them():
+    assert cut(flown(60), 10).repeated == 1
+    assert cut(flown(64), 10).repeated == pytest.approx(70 / 64)
+
+
+@pytest.mark.parametrize(("flights", "length", "count"), [((9,) * 20 + (10,), 9, 22), ((50, 4, 3), 10, 5)])
+def test_the_length_is_that_which_tells_most_in_all(flights, length, count):
+    """One longer flight doesn't throw all others away, nor do scraps cut a long one into small pieces."""
+    data = flown(sum(flights))
+    data.trajectory[:] = torch.arange(len(flights)).repeat_interleave(torch.tensor(flights))
+    assert cut(data, 10).action.shape[:2] == (count, length)
+
+
 def test_a_gap_ends_a_stretch_and_short_flights_have_none():
     data = flown(30)
     cuts = cut(data.select(torch.tensor([i for i in range(30) if i != 12])), 10)
