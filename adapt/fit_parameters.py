@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
-from adapt.parameter_losses import NEGLIGIBLE, OneStep, Shooting, size
+from adapt.parameter_losses import NEGLIGIBLE, OneStep, Shooting, least_squares, size
 from adapt.parameter_residual import candidates, changed, nominal
 from adapt.prediction import prediction_error
 from adapt.sensitivities import apart
@@ -202,7 +202,7 @@ def settle(loss, names, start):
         errors = _standard_errors(loss, left, effects) * sizes
         if not names:
             break
-        change = torch.linalg.lstsq(effects, left[:, None]).solution[:, 0]
+        change = least_squares(effects, left[:, None])[:, 0]
         values = {name: values[name] + float(c * s) for name, c, s in zip(names, change, sizes, strict=True)}
         if change.abs().max() < SETTLED:
             break

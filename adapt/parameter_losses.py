@@ -47,6 +47,13 @@ def central(evaluate, base, values, name):
     return (ahead - behind) * size(base.system, name) / (above - below)
 
 
+def least_squares(effects, left):
+    """The changes (…, p, c) whose effects (…, R, p) come closest to `left` (…, R, c), of these the smallest."""
+    # not torch's default, gelsy: it reads memory that it hasn't set, so results, even ranks, differ from run to run
+    # (https://github.com/pytorch/pytorch/issues/187411)
+    return torch.linalg.lstsq(effects, left, driver="gelsd").solution
+
+
 class OneStep:
     """Accelerations over one control period. Residuals are in rows of transitions, outputs side by side."""
 
@@ -115,7 +122,7 @@ class Shooting:
                 break
             if not left.isfinite().all() or not inner.isfinite().all():  # LAPACK fails on them
                 raise InputError("transitions: no flight can be predicted from such states; remove what isn't flight")
-            change = torch.linalg.lstsq(self._scaled(inner), self._scaled(left[..., None])).solution
+            change = least_squares(self._scaled(inner), self._scaled(left[..., None]))
             self.start = displaced(system, self.start, change.squeeze(-1))
             path = self.flown.predicted(dynamics, self.start)
         return path, slopes, inner, left

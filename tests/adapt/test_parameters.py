@@ -7,7 +7,7 @@ import torch
 
 from adapt import collect, fit_parameters, report
 from adapt.fit_parameters import search, undetermined
-from adapt.parameter_losses import OneStep, Shooting
+from adapt.parameter_losses import OneStep, Shooting, least_squares
 from adapt.parameter_residual import changed, own_parameters
 from adapt.residual import fit_residual
 from adapt.residual_dynamics import ResidualConfig
@@ -261,6 +261,14 @@ def residual_of(parameters, values, name="quadrotor"):
     residual = make_residual(make_dynamics(name), ResidualConfig("parameters", 0, factors=(), parameters=parameters))
     residual.values = torch.tensor(values, dtype=torch.float64)
     return residual
+
+
+def test_least_squares_do_not_depend_on_what_the_memory_held_before():
+    effects = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    for _ in range(20):
+        torch.ones(3, dtype=torch.int32)  # and freed, so that the next three integers are likely to lie there
+        found = least_squares(effects, torch.ones(3, 1, dtype=torch.float64))
+        torch.testing.assert_close(found[:, 0], torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64))
 
 
 def test_a_parameter_residual_is_the_target_that_has_these_parameters(tmp_path):
