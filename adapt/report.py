@@ -79,10 +79,11 @@ def parameter_table(residual):
 
 def notes(metrics):
     """What a user should not overlook in the numbers."""
-    return [*_broken_flights(metrics.get("plant")), *_worth(metrics)]
+    return [*broken_flights(metrics.get("plant")), *_worth(metrics)]
 
 
-def _broken_flights(plant):
+def broken_flights(plant):
+    """What to say of flights that broke off, from `adapt.plants.Flights.report`; nothing where none did."""
     if not plant or not plant["broken"]:
         return []
     lost = f"; then it was given up ({plant['faults'][-1]})" if plant["given up"] else ""

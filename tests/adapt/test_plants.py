@@ -330,6 +330,11 @@ def bridge(tmp_path, monkeypatch):
         "    def reset(self, state): self.now = torch.tensor(state); return state\n"
         "    def step(self, state, action):\n"
         "        self.now = self.dynamics(self.now, torch.tensor(action)); return self.now.numpy()\n"
+        "def pushed(system):\n"
+        "    from envs import make_dynamics\n"
+        "    plant = Bridge(system)\n"
+        "    plant.dynamics = make_dynamics(system, 'push=1')\n"
+        "    return plant\n"
         "def cut(system): raise OSError('no cable')\n"
         "class Dying(Bridge):\n"
         "    left = 45\n"
@@ -351,6 +356,46 @@ def test_the_command_flies_a_plant_of_ones_own(bridge, call, cartpole_file, tmp_
     assert metrics["few_shot"]["n"] == 3
     assert metrics["plant"]["broken"] == 0
     assert {"flight.png", "transitions.csv", "policy.safetensors"} <= {path.name for path in out.iterdir()}
+
+
+def test_evaluation_in_a_plant_of_our_equations_is_that_in_the_model(bridge, call, cartpole_file, tmp_path):
+    cart, found = ("--system", "cartpole", "--policy", cartpole_file, "--episodes", 3), {}
+    for name, more in {"model": (), "plant": ("--plant", "my_bridge:Bridge")}.items():
+        assert call("evaluate", *cart, *more, "--out", tmp_path / name).status == 0
+        found[name] = json.loads((tmp_path / name).read_text())
+    assert found["plant"]["mean"] == pytest.approx(found["model"]["mean"], rel=1e-4)
+    assert found["plant"]["plant"]["flights"] == 3
+
+
+def test_a_planner_plans_in_what_it_learned_of_a_plant(bridge, call, tmp_path):
+    """The plant is pushed, which its model doesn't know; a residual of its transitions tells the planner."""
+    errors = {}
+    for name, more in {"mpc": (), "mpc-residual": ("--samples", 60)}.items():
+        flown = ("--system", "cartpole", "--plant", "my_bridge:pushed", "--method", name, "--episodes", 1, *more)
+        assert call("evaluate", *flown, "--out", tmp_path / name).status == 0
+        errors[name] = json.loads((tmp_path / name).read_text())["mean"]
+    assert errors["mpc-residual"] < 0.5 * errors["mpc"]
+
+
+def test_evaluation_tells_of_flights_that_broke_off(bridge, call, cartpole_file):
+    cart = ("--system", "cartpole", "--policy", cartpole_file, "--episodes", 2)
+    answer = call("evaluate", *cart, "--plant", "my_bridge:Dying")
+    assert answer.status == 0
+    assert "flights of the plant broke off (flight 1, step 46: OSError: link lost)" in answer.out
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--target", "drag=1"), "--target"),
+        (("--gradient",), "--gradient"),
+        (("--method", "mpc-target"), "--method mpc-target"),
+        (("--method", "apg-pixels"), "--method apg-pixels"),
+    ],
+)
+def test_what_evaluation_in_a_plant_has_no_use_for_is_refused(refused, options, named):
+    said = refused("evaluate", "--system", "cartpole", "--plant", "my_bridge:Bridge", *options)
+    assert f"--plant and {named}: a plant " in said
 
 
 @pytest.mark.parametrize("more", [(), ("--rounds", 3), ("--collect",)], ids=str)
