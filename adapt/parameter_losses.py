@@ -12,11 +12,12 @@ model in Ljung 1999, ch. 5), so that noise is averaged over the stretch and ente
 
 import torch
 
-from adapt.parameter_residual import changed, nominal
+from adapt.parameter_residual import nominal
 from adapt.prediction import predict
 from adapt.sensitivities import apart, of_kicks, of_start, step_slopes
 from adapt.sparse_ridge import blocks
 from adapt.stretches import cut, difference, displaced
+from adapt.variants import Variants
 from envs.errors import InputError
 
 STEP = 1e-4  # [-] of a parameter's size, for central differences
@@ -33,18 +34,19 @@ def size(system, name):
     return max(abs(nominal(system, name)), SIZE)
 
 
-def central(evaluate, base, values, name):
+def central(evaluate, variants, values, name):
     """The difference of `evaluate(dynamics)` by a parameter in its size: central, one-sided at a bound."""
-    here, step = values.get(name, nominal(base.system, name)), STEP * size(base.system, name)
+    system = variants.base.system
+    here, step = values.get(name, nominal(system, name)), STEP * size(system, name)
     ends = []
     for shift in (step, -step):
         try:
-            dynamics = changed(base, {**values, name: here + shift})
+            dynamics = variants({**values, name: here + shift})
         except InputError:  # beyond what makes sense
-            dynamics, shift = changed(base, values), 0.0
+            dynamics, shift = variants(values), 0.0
         ends.append((evaluate(dynamics), shift))
     (ahead, above), (behind, below) = ends
-    return (ahead - behind) * size(base.system, name) / (above - below)
+    return (ahead - behind) * size(system, name) / (above - below)
 
 
 def least_squares(effects, left):
@@ -72,10 +74,11 @@ class OneStep:
 
     def linearised(self, values, names):
         """What is missed (R,) and the effects (R, p) of the parameters `names` in their sizes, at the given values."""
-        left = self.missed(changed(self.base, values))
+        variants = Variants(self.base)
+        left = self.missed(variants(values))
         spread = left.square().mean(0).sqrt()
         weights = 1 / spread.clamp(min=max(NEGLIGIBLE, 1e-3 * float(spread.max())))
-        effects = [-(central(self.missed, self.base, values, name) * weights).flatten() for name in names]
+        effects = [-(central(self.missed, variants, values, name) * weights).flatten() for name in names]
         return (left * weights).flatten(), torch.stack(effects, -1) if names else left.new_zeros(left.numel(), 0)
 
 
@@ -102,8 +105,9 @@ class Shooting:
         Raises:
             InputError: states or values from which no flight can be predicted.
         """
-        path, slopes, inner, left = self.settle(changed(self.base, values))
-        parts = torch.cat((left[..., None], of_kicks(slopes, self._kicks(path, values, names))), -1)
+        variants = Variants(self.base)
+        path, slopes, inner, left = self.settle(variants(values))
+        parts = torch.cat((left[..., None], of_kicks(slopes, self._kicks(path, variants, values, names))), -1)
         rest = apart(self._scaled(parts), self._scaled(inner)).flatten(0, 1)
         return rest[:, 0], rest[:, 1:]
 
@@ -127,14 +131,14 @@ class Shooting:
             path = self.flown.predicted(dynamics, self.start)
         return path, slopes, inner, left
 
-    def _kicks(self, path, values, names):
+    def _kicks(self, path, variants, values, names):
         """What a change of each parameter, in its size, adds to every step of the path: (M, T, d, p)."""
         before, after = path[:, :-1], path[:, 1:]
 
         def step(dynamics):
             return difference(dynamics.system, after, dynamics(before, self.flown.action))
 
-        kicks = [central(step, self.base, values, name) for name in names]
+        kicks = [central(step, variants, values, name) for name in names]
         return torch.stack(kicks, -1) if names else before.new_zeros(*before.shape[:2], len(self.noise), 0)
 
     def _estimate_noise(self, left):

@@ -67,8 +67,11 @@ class ParameterResidual(ResidualDynamics):
         return self.changed.casadi()
 
 
-def changed(base, values):
+def changed(base, values, change=replace):
     """Dynamics with these values {name: number} of parameters.
+
+    Args:
+        change: makes a system with other fields, given by name.
 
     Raises:
         InputError: values that make no physical sense, such as a negative mass.
@@ -81,5 +84,5 @@ def changed(base, values):
             force, _, axis = name.rpartition("_") if name not in SCALAR else (name, "", "x")
             strengths.setdefault(force, [0.0, 0.0, 0.0])[AXES.index(axis)] = value
     forces = tuple(partial(DISTURBANCES[name], strength=tuple(strength)) for name, strength in strengths.items())
-    system = replace(system.configured(), **own) if own else system
+    system = change(system.configured(), **own) if own else system
     return replace(base, system=system, disturbances=(*base.disturbances, *forces))

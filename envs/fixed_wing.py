@@ -164,11 +164,8 @@ class FixedWing(System):
         side, roll, yaw = (pressure * _weighted(c, lateral) for c in (self.side, self.roll, self.yaw))
         thrust = (1 - self.thrust_loss) * self.thrust_max / 2 * (1 + u.thrust)
         cos, sin = ua / plane, wa / plane
-        force = (
-            math.cos(self.thrust_angle) * thrust - drag * cos + lift * sin,
-            side,
-            math.sin(self.thrust_angle) * thrust - drag * sin - lift * cos,
-        )
+        ahead, down = _direction(self.thrust_angle)
+        force = (ahead * thrust - drag * cos + lift * sin, side, down * thrust - drag * sin - lift * cos)
         return force, (self.span * roll, self.chord * pitch, self.span * yaw)
 
     def _angular_acceleration(self, rates, torque):
@@ -227,6 +224,11 @@ CRUISE = 11.5  # [m/s] speed at which the task starts
 # [m^2/s^2] added to squares of airspeeds: keeps angles, forces and their gradients finite where the air stands still
 # about the aircraft, as in a tail wind as fast as it flies. In flight it changes them by less than 1e-8 of themselves.
 CALM = 1e-6
+
+
+def _direction(angle):
+    """Cosine and sine of a parameter [rad], which is a number, or a symbol where equations are compiled."""
+    return (math.cos(angle), math.sin(angle)) if isinstance(angle, float) else (angle.cos(), angle.sin())
 
 
 def _weighted(coefficients, values):

@@ -168,7 +168,7 @@ class Quadrotor(System):
             j, k = (i + 1) % 3, (i + 2) % 3
             control = (believed[i] / inertia[i] * gains[i]) * (limits[i] * wanted[i] - rates[i])
             gyroscopic = (surplus[k] - surplus[j]) / inertia[i]
-            answer.append(control + gyroscopic * rates[j] * rates[k] if gyroscopic else control)
+            answer.append(control + gyroscopic * rates[j] * rates[k])
         return answer
 
     def velocity(self, x):

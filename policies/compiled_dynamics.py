@@ -46,14 +46,7 @@ class CompiledDynamics:
 
     def __init__(self, dynamics):
         self.dynamics, self.system, self.dt = dynamics, dynamics.system, dynamics.dt
-        path = shared_library(_source(dynamics.casadi()))
-        try:
-            library = ctypes.CDLL(str(path))
-        except OSError as error:  # a folder that programs may not be run from, or a damaged file
-            raise CompilerError(f"{path}: can't be loaded ({error})") from None
-        self._forward, self._backward = (getattr(library, f"{name}_batch") for name in (FORWARD, BACKWARD))
-        for function, pointers in ((self._forward, 3), (self._backward, 5)):
-            function.argtypes, function.restype = [ctypes.c_longlong, *[ctypes.c_void_p] * pointers], None
+        self._forward, self._backward = compile_batches(_functions(dynamics.casadi()))
 
     @property
     def noise(self):
@@ -83,23 +76,52 @@ class _Step(torch.autograd.Function):
     @staticmethod
     def forward(ctx, state, action, compiled):
         ctx.compiled, ctx.kind = compiled, state.dtype
-        state, action = _doubles(state), _doubles(action)
+        state, action = doubles(state), doubles(action)
         ctx.save_for_backward(state, action)
         return compiled.step(state, action).to(ctx.kind)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, slope):
-        parts = ctx.compiled.back(*ctx.saved_tensors, _doubles(slope))
+        parts = ctx.compiled.back(*ctx.saved_tensors, doubles(slope))
         return *(part.to(ctx.kind) for part in parts), None
 
 
-def _doubles(tensor):
+def doubles(tensor):
+    """The numbers of a tensor as compiled functions read them."""
     return tensor.detach().to("cpu", torch.float64).contiguous()
 
 
-def _source(step):
-    """C of a CasADi step (state, action) -> next_state and of its derivative in reverse, each for a batch."""
+def compile_batches(functions, shared=0):
+    """CasADi functions for whole batches: each is called with the number of rows, then the addresses of its arrays.
+
+    The arrays are contiguous doubles, one for each input and output, with a row for each call.
+
+    Args:
+        shared: how many inputs, the last ones, are a single row that all calls share.
+
+    Raises:
+        CompilerError: no compiler, one that fails, or a library that can't be loaded.
+    """
+    import casadi
+
+    generator = casadi.CodeGenerator("step")
+    for function in functions:
+        generator.add(function)
+    path = shared_library(generator.dump() + "".join(_loop(function, shared) for function in functions))
+    try:
+        library = ctypes.CDLL(str(path))
+    except OSError as error:  # a folder that programs may not be run from, or a damaged file
+        raise CompilerError(f"{path}: can't be loaded ({error})") from None
+    loaded = [getattr(library, f"{function.name()}_batch") for function in functions]
+    for function, batch in zip(functions, loaded, strict=True):
+        pointers = [ctypes.c_void_p] * (function.n_in() + function.n_out())
+        batch.argtypes, batch.restype = [ctypes.c_longlong, *pointers], None
+    return loaded
+
+
+def _functions(step):
+    """A CasADi step (state, action) -> next_state and its derivative in reverse."""
     import casadi
 
     kind = casadi.SX if step.is_a("SXFunction") else casadi.MX
@@ -109,26 +131,23 @@ def _source(step):
         casadi.jtimes(following, casadi.vertcat(state, action), slope, True),
         [0, state.numel(), state.numel() + action.numel()],
     )
-    functions = (
+    return (
         casadi.Function(FORWARD, [state, action], [following], {"cse": True}),
         casadi.Function(BACKWARD, [state, action, slope], back, {"cse": True}),
     )
-    generator = casadi.CodeGenerator("step")
-    for function in functions:
-        generator.add(function)
-    return generator.dump() + "".join(map(_loop, functions))
 
 
 def _sizes(step):
     return step.numel_in(0), step.numel_in(1), step.numel_out(0)
 
 
-def _loop(function):
-    """C that calls a generated function for every row of contiguous arrays, one array for each input and output."""
+def _loop(function, shared):
+    """C that calls a generated function for every row of its arrays."""
     inputs = [function.numel_in(i) for i in range(function.n_in())]
     outputs = [function.numel_out(i) for i in range(function.n_out())]
     named = [f"const double *a{i}" for i in range(len(inputs))] + [f"double *r{i}" for i in range(len(outputs))]
-    places = [f"arg[{i}] = a{i} + i * {size};" for i, size in enumerate(inputs)]
+    rows = [*inputs[: len(inputs) - shared], *[0] * shared]
+    places = [f"arg[{i}] = a{i} + i * {size};" for i, size in enumerate(rows)]
     places += [f"res[{i}] = r{i} + i * {size};" for i, size in enumerate(outputs)]
     return LOOP.format(
         name=function.name(),
