@@ -16,6 +16,7 @@ from adapt.gate import Gate, Verdict, nothing_found
 from adapt.labelling import check_labels
 from adapt.mending import mended, still_true
 from adapt.plants import flights_of
+from adapt.plausible import check_units
 from adapt.prediction import prediction_error
 from adapt.residual_dynamics import ResidualDynamics
 from adapt.rounds import check_flown, fly, fly_in_rounds, held_out
@@ -202,7 +203,7 @@ def _mended(transitions, source, notes, keep):
     transitions, mends = mended(transitions)
     if mends:
         keep("transitions", transitions)
-    notes += [*mends, *check_labels(transitions, source)]
+    notes += [*mends, *check_units(transitions, source.system), *check_labels(transitions, source)]
     return transitions
 
 

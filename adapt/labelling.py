@@ -41,7 +41,7 @@ def check_labels(transitions, base):
         gain, words = max(sure)
         better = f"the model explains them {math.exp(gain):.1f} times as well {words}"
         if words != DELAYED:
-            raise InputError(f"transitions: {better}; put the actions right and begin again")
+            raise InputError(f"transitions: {better}; put the actions, or the axes, right and begin again")
         return [f"{better}: the robot acts late, or was recorded early, and no residual learns a delay"]
     return []
 

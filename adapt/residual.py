@@ -191,7 +191,7 @@ def _check_prediction(base, data):
         lost = (~base(data.state, data.action).isfinite()).any(-1).nonzero()
     if len(lost):
         raise InputError(
-            f"transitions: row {int(lost[0]) + 1}: {data.system}'s model can't go on from this state; remove it"
+            f"transitions: transition {int(lost[0]) + 1}: {data.system}'s model can't go on from this state; remove it"
         )
 
 

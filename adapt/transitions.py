@@ -148,8 +148,8 @@ def check(transitions, system=None, minimum=1, source="transitions"):
     """Refuse transitions that nothing can be learned from, or that are of another robot than `system`.
 
     Raises:
-        InputError: too few rows, another system, other names, another control period, a number that isn't finite, a
-            quaternion that isn't a unit one. Rows count from 1.
+        InputError: too few rows, another system, other names, another control period, a number that isn't finite or is
+            too large, a quaternion that is no unit one.
     """
     if len(transitions) < minimum:
         raise InputError(f"{source}: {len(transitions)} transitions, at least {minimum} are needed; record more")
@@ -159,7 +159,11 @@ def check(transitions, system=None, minimum=1, source="transitions"):
         values = getattr(transitions, part)
         if values is not None and not torch.isfinite(values).all():
             row = int((~torch.isfinite(values)).any(-1).nonzero()[0]) + 1
-            raise InputError(f"{source}: row {row}: {part} is not finite; remove the row")
+            raise InputError(f"{source}: transition {row}: {part} is not finite; remove the row")
+        if values is not None and values.abs().max() > LARGEST:
+            row = int((values.abs() > LARGEST).any(-1).nonzero()[0]) + 1
+            largest = float(values[row - 1].abs().max())
+            raise InputError(f"{source}: transition {row}: {part} is as large as {largest:.3g}; remove the row")
     if set(QUATERNION) <= set(transitions.state_names):
         _check_quaternions(transitions, source)
 
@@ -187,7 +191,5 @@ def _check_quaternions(transitions, source):
         wrong = ((length - 1).abs() > QUATERNION_TOLERANCE).nonzero()
         if len(wrong):
             row = int(wrong[0])
-            raise InputError(
-                f"{source}: row {row + 1}: {', '.join(QUATERNION)} of {part} have length {float(length[row]):.4g}, "
-                "expected a unit quaternion, scalar first"
-            )
+            said = f"{', '.join(QUATERNION)} of {part} have length {float(length[row]):.4g}"
+            raise InputError(f"{source}: transition {row + 1}: {said}, expected a unit quaternion, scalar first")
