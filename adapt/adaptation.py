@@ -23,8 +23,10 @@ from adapt.rounds import check_flown, fly, fly_in_rounds, held_out
 from adapt.sensor_noise import sensor_noise
 from adapt.transitions import Transitions, check
 from adapt.trust_region import same_weights
+from envs.domains import parse_target
 from envs.dynamics import Dynamics
 from envs.errors import InputError
+from envs.registry import make_dynamics
 from policies import METHODS
 from policies.checkpoints import Policy
 from policies.evaluate import Evaluation, evaluate, test_episodes
@@ -87,8 +89,9 @@ def adapt(
 
     Args:
         policy: a `Policy` that analytic policy gradients made; its task's system is the source.
-        target: dynamics to fly and to evaluate in. None where the target is known by its transitions only: then
-            policies are evaluated in the model with the residual, which stands in for it.
+        target: dynamics to fly and to evaluate in, or how they differ, such as "drag=0.3 mass=x1.2". None where the
+            target is known by its transitions only: then policies are evaluated in the model with the residual, which
+            stands in for it.
         plant: a `Plant` to fly and to evaluate in instead, or `Flights` of one: its equations are not needed.
         samples: transitions to fly in the target; ignored where `transitions` are given.
         transitions: recorded `Transitions` to learn from instead.
@@ -118,6 +121,9 @@ def adapt(
             actions are swapped or shifted (`adapt.labelling`), or a plant has other states or another control period,
             or gives nothing to learn from.
     """
+    if isinstance(target, str):
+        domain = parse_target(target, policy.task.system)
+        target, seen = make_dynamics(policy.task.system, domain), seen or domain.seen(policy.task)
     if plant is not None:
         target = flights_of(plant, policy, target, oracle)
     _check(policy, target, transitions, oracle)
@@ -191,6 +197,8 @@ def _check(policy, target, transitions, oracle):
     """Refuse what can't be adapted with."""
     if METHODS[policy.method].pixels and (target is None or transitions is not None):
         raise InputError("adapt: a policy that sees pictures learns from them, and has to fly in the target to get any")
+    if target is not None and target.system.name != policy.task.system.name:
+        raise InputError(f"adapt: the target is a {target.system.name}, the policy flies a {policy.task.system.name}")
     if target is None and transitions is None:
         raise InputError("adapt: needs a target to fly in, or recorded transitions")
     if target is None and oracle:

@@ -40,8 +40,6 @@ COLUMNS = (
     *("threads", "python", "torch", "torchrl", "tensordict", "casadi", "commit"),
 )
 KEY = ("system", "index", "seed")
-WORSE, BETTER = 1.05, 0.95  # new over old error beyond which a policy got worse or better
-FEWER = 0.02  # share of flights that may fail more, or fewer, before a policy counts as worse, or better, for it
 
 
 @dataclass(frozen=True)
@@ -105,6 +103,7 @@ def _audit(options, folder):
     from tqdm import tqdm
 
     from adapt import sweep
+    from adapt.audit_case import WORSE
     from envs.registry import SYSTEMS
 
     names = dict.fromkeys(options.system or SYSTEMS)

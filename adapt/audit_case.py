@@ -8,7 +8,6 @@ from dataclasses import replace
 import torch
 
 from adapt.adaptation import adapt
-from adapt.audit import FEWER
 from adapt.audit_targets import draw
 from adapt.command import environment
 from adapt.flying import collect
@@ -18,6 +17,8 @@ from envs.registry import make_dynamics
 from policies.checkpoints import load_policy
 from policies.evaluate import evaluate, test_episodes
 
+WORSE, BETTER = 1.05, 0.95  # new over old error beyond which a policy got worse or better
+FEWER = 0.02  # share of flights that may fail more, or fewer, before a policy counts as worse, or better, for it
 EXPLORATION = 0.1  # standard deviation of noise on the actions flown for data, as `adapt` has it
 SPENT = ("seconds", "cpu_seconds")
 STAGES = ("fit", "finetune", "gate")

@@ -6,7 +6,7 @@ import pandas as pd
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
-from adapt.audit import BETTER, FEWER, WORSE
+from adapt.audit_case import BETTER, FEWER, WORSE
 from adapt.figure_parts import BLUE, ORANGE, panels
 from adapt.plot_style import DPI, GREY, STYLE
 from policies.files import whole

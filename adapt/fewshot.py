@@ -111,12 +111,16 @@ def main(options):
     recorded, validation = transitions_of(options, setting)
     outputs = (*RESULTS, *PICTURES)
     folder = command.output_folder(options.out or default_folder(options), options.overwrite, outputs)
-    adaptation = _adapt(options, setting, policy, recorded, folder, device)
-    _write_tuning(adaptation.history, folder / "tuning.csv")
-    metrics = _metrics(options, policy, adaptation, validation)
-    command.write_json(folder / "metrics.json", metrics)
-    print(report.table(metrics))
-    _pictures(options, adaptation, folder)
+    try:
+        adaptation = _adapt(options, setting, policy, recorded, folder, device)
+        _write_tuning(adaptation.history, folder / "tuning.csv")
+        metrics = _metrics(options, policy, adaptation, validation)
+        command.write_json(folder / "metrics.json", metrics)
+        print(report.table(metrics))
+        _pictures(options, adaptation, folder)
+    except KeyboardInterrupt:
+        said = f"what was finished is in {folder}; --overwrite begins again" if any(folder.iterdir()) else ""
+        raise KeyboardInterrupt(said) from None
     files = "metrics.json, policy.safetensors, residual.safetensors, transitions.csv, tuning.csv, pictures"
     print(f"results in {folder}/: {files}")
 
@@ -142,6 +146,12 @@ def _check(options):
         raise InputError("--log and --transitions: give one of the two")
     if options.log and not options.vehicle:
         raise InputError("--log: needs --vehicle, which says what the motor commands mean")
+    if options.mapping != Options.mapping and not options.log:
+        raise InputError("--mapping: says what a log's columns are; give the log with --log, or leave it out")
+    if (options.log or options.transitions) and options.rounds is not None:
+        raise InputError("--rounds: parts of a flight for data; leave it out with --log and --transitions")
+    if options.watch and recorded_only(options):
+        raise InputError("--watch: flies in the target, which a record is not; leave it out, or name it with --target")
     if options.validate and not options.log:
         raise InputError("--validate: needs --log to learn from")
     learned = {Path(path).resolve() for path in options.log}
@@ -212,8 +222,6 @@ def _adapt(options, setting, policy, recorded, folder, device):
             stage=lambda name: print(f"{name} ...", flush=True),
             keep=keep,
         )
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"what was finished is in {folder}") from None
     except InputError as error:
         if recorded is not None or not (folder / "transitions.csv").exists():  # nothing was flown that would be lost
             for name in RESULTS:

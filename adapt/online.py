@@ -58,7 +58,7 @@ class Options:
     seed: int = 0
     """Seed of everything that is drawn."""
     out: str | None = None
-    """Folder for the results (default: runs/online-SYSTEM-SECONDSs-seedN)."""
+    """Folder for the results (default: runs/online-SYSTEM-TARGETS-SECONDSs-seedN)."""
     overwrite: bool = False
     """Replace what the folder holds."""
 
@@ -137,7 +137,9 @@ def _default_folder(options):
     from pathlib import Path
 
     robot = Path(options.vehicle).stem if options.vehicle else options.system
-    return f"runs/online-{robot}-{options.seconds:g}s-seed{options.seed}"
+    text = "-".join((robot, *options.target))
+    text = "".join(c if c.isalnum() or c in "-_.=,@" else "-" for c in text)
+    return f"runs/online-{text}-{options.seconds:g}s-seed{options.seed}"
 
 
 def _fly(options, flight, policy, settings, timing, interrupted):

@@ -188,11 +188,14 @@ def make_plant(name, system):
     try:
         make = getattr(import_module(module), factory)
     except (ImportError, AttributeError) as error:
-        raise InputError(f"--plant {name}: can't be imported ({error})") from None
+        where = "; the working folder and PYTHONPATH are searched"
+        raise InputError(f"--plant {name}: can't be imported ({error}){where}") from None
     try:
         return make(system)
     except Exception as error:
-        raise InputError(f"--plant {name}: {factory} failed ({type(error).__name__}: {error})") from error
+        raise InputError(
+            f"--plant {name}: {factory}(system), which makes the plant, failed ({type(error).__name__}: {error})"
+        ) from error
 
 
 def _simulator(name, simulator, system):

@@ -38,6 +38,7 @@ def table(metrics):
             errors = {name: table for name, table in metrics[key].items() if name != "n"}
             rows = [(UNITS.get(row, row), *(table[row] for table in errors.values())) for row in errors["model"]]
             parts.append(tabulate(rows, (title, *errors), "simple", floatfmt=".3g"))
+    parts.append(residual_line(metrics["residual"]))
     parts.extend(parameter_table(metrics["residual"]))
     if "gate" in metrics:
         parts.append(gate_line(metrics["gate"]))
@@ -52,6 +53,18 @@ def gate_line(verdict):
     way = "" if verdict["share"] == 1 else f" {verdict['share']:.0%} of the way to"
     done = f"gate: took{way} the new policy" if verdict["accepted"] else "gate: kept the old policy"
     return f"{done}; {verdict['reason']}"
+
+
+def residual_line(residual):
+    """Which kind was taken, and how those that were tried predict flight that was held out."""
+    tried = residual.get("tried", {})
+    if not tried:
+        return f"residual: {residual['kind']}"
+    if list(tried) == [residual["kind"]]:
+        return f"residual: {residual['kind']}, which leaves next to nothing"
+    scores = {kind: f"{score:.2f}" if isinstance(score, float) else "can't be fitted" for kind, score in tried.items()}
+    told = ", ".join(f"{kind} {score}" for kind, score in scores.items())
+    return f"residual: {residual['kind']}; error of held-out flight, relative: {told}"
 
 
 def parameter_table(residual):

@@ -97,7 +97,11 @@ def default_folder(options):
     robot = Path(options.vehicle).stem if options.vehicle else options.system
     text = "-".join((robot, *(["pixels"] if options.pixels else []), *target_text(options).split()))
     text = "".join(c if c.isalnum() or c in "-_.=," else "-" for c in text)
-    return f"runs/fewshot-{text}-n{options.samples}-seed{options.seed}"
+    if recorded_only(options):
+        flown = ""
+    else:
+        flown = f"-{Path(options.transitions).stem}" if options.transitions else f"-n{options.samples}"
+    return f"runs/fewshot-{text}{flown}-seed{options.seed}"
 
 
 def recorded_only(options):

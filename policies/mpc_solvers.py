@@ -106,13 +106,26 @@ class Buffered:
 
     def __init__(self, function, outputs):
         names, results = function.name_in(), function.name_out()
-        self._buffer, self.run = function.buffer()
+        self._buffer, self._run = function.buffer()
         self.inputs = {name: np.zeros(function.numel_in(name)) for name in names}
         self.outputs = {name: np.zeros(function.numel_out(name)) for name in outputs}
         for name, array in self.inputs.items():
             self._buffer.set_arg(names.index(name), memoryview(array))
         for name, array in self.outputs.items():
             self._buffer.set_res(results.index(name), memoryview(array))
+
+    def run(self):
+        """Fill the outputs.
+
+        Raises:
+            RuntimeError: the function failed.
+        """
+        try:
+            self._run()
+        except (SystemError, RuntimeError) as error:  # as which CasADi tells of Ctrl-C
+            if isinstance(error.__cause__, KeyboardInterrupt) or str(error) == "KeyboardInterrupt":
+                raise KeyboardInterrupt from None
+            raise
 
 
 class NonlinearSolver:

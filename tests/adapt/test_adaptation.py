@@ -194,6 +194,14 @@ def test_recorded_transitions_with_a_context_can_be_tried_in_a_target(rough_cart
     assert result.prediction["model + residual"]["velocity"] < 0.1 * result.prediction["model"]["velocity"]
 
 
+def test_a_target_may_be_text_and_must_be_of_the_same_robot(rough_cartpole, target):
+    few = {"samples": 30, "config": replace(QUICK, updates=1), "kind": "linear", "gate": False, "episodes": 2}
+    spoken, made = (adapt(rough_cartpole, which, **few) for which in (TARGET, target))
+    assert torch.equal(spoken.transitions.next_state, made.transitions.next_state)
+    with pytest.raises(InputError, match="the target is a quadrotor, the policy flies a cartpole"):
+        adapt(rough_cartpole, make_dynamics("quadrotor"))
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -233,6 +233,8 @@ def test_the_folder_is_named_after_the_run(call, cart, tmp_path, monkeypatch):
         (("--transitions", "none.txt"), "unknown kind of file '.txt'"),
         (("--log", "a.csv"), "--log"),
         (("--validate", "a.csv"), "--validate: needs --log"),
+        (("--mapping", "my.toml"), "--mapping: says what a log's columns are; give the log with --log"),
+        (("--transitions", "a.csv", "--rounds", "2"), "--rounds: parts of a flight for data; leave it out"),
         (("--threads", "0"), "--threads 0"),
         (("--seed", "-1"), "--seed -1: expected between 0"),
         (("--seed", "9" * 30), "expected between 0 and 2^63 - 1"),
@@ -480,7 +482,7 @@ def test_as_a_process_ctrl_c_in_the_fine_tuning_ends_with_130(cart, tmp_path, st
     run.send_signal(signal.SIGINT)
     errors = stderr_lines(run.communicate(timeout=60)[1].decode())
     assert run.returncode == 130
-    assert errors == [f"fewshot: interrupted; what was finished is in {tmp_path}"]
+    assert errors == [f"fewshot: interrupted; what was finished is in {tmp_path}; --overwrite begins again"]
     assert {path.name for path in tmp_path.iterdir()} == {"config.json", "transitions.csv", "residual.safetensors"}
     assert Transitions.load(tmp_path / "transitions.csv", make_system("cartpole"))
     assert load_residual(tmp_path / "residual.safetensors")

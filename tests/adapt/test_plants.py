@@ -422,7 +422,10 @@ def test_the_command_ends_well_and_draws_what_there_is_where_a_plant_dies(bridge
         ),
         (("--plant", "no_such:thing"), "can't be imported (No module named 'no_such')"),
         (("--plant", "my_bridge:Other"), "can't be imported (module 'my_bridge' has no attribute 'Other')"),
-        (("--plant", "my_bridge:cut"), "--plant my_bridge:cut: cut failed (OSError: no cable)"),
+        (
+            ("--plant", "my_bridge:cut"),
+            "cut: cut(system), which makes the plant, failed (OSError: no cable)",
+        ),
         (("--plant", "rotorpy", "--system", "cartpole"), "--plant rotorpy: is a quadrotor, the robot is a cartpole"),
         (("--plant", "jsbsim", "--system", "cartpole"), "--plant jsbsim: is a fixed_wing, the robot is a cartpole"),
         (("--plant", "my_bridge:Bridge", "--oracle"), "--plant: is the target, without equations"),

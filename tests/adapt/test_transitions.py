@@ -162,7 +162,7 @@ def put(row, column, value):
         (put(3, "next_vx", "nan"), "row 5: next_vx is 'nan', expected a finite number"),
         (put(3, "action_thrust", ""), "row 5: action_thrust is '', expected a finite number"),
         (edit(lambda lines: lines[4].pop()), "row 6: next_r is '', expected a finite number"),
-        (put(3, "qw", "0.5"), "row 3: qw, qx, qy, qz of state have length"),
+        (put(3, "qw", "0.5"), "transition 3: qw, qx, qy, qz of state have length"),
         (lambda text: text.replace("dt=0.1", "dt=0.05"), "control period is 0.05 s, expected 0.1 s"),
         (lambda text: text.replace("dt=0.1", "dt=short"), "dt is 'short s'"),
         (lambda text: text.replace("system=quadrotor", "system=fixed_wing"), "recorded on fixed_wing"),

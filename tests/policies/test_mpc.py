@@ -546,3 +546,27 @@ def test_it_plans_from_what_was_measured_where_sensors_err():
     actions = [MPC(env.dynamics, env.task)(what.clone())["action"] for what in (now, seen, now.exclude("measured"))]
     assert torch.equal(actions[0], actions[1])
     assert not torch.equal(actions[0], actions[2])
+
+
+@pytest.mark.parametrize("words", ["KeyboardInterrupt", "process failed"])
+def test_an_interrupt_within_a_solver_is_no_failed_plan(words):
+    """CasADi tells of Ctrl-C in two ways, of which neither is a `KeyboardInterrupt`."""
+
+    def failing():
+        raise RuntimeError(words)
+
+    mpc = MPC(make_dynamics("cartpole"), make_task("cartpole"))
+    buffer = mpc._solver._solver
+    buffer._run = failing
+    with pytest.raises(KeyboardInterrupt if words == "KeyboardInterrupt" else RuntimeError):
+        buffer.run()
+
+
+def test_an_interrupt_that_casadi_returns_from_is_one():
+    def returning():
+        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+
+    mpc = MPC(make_dynamics("cartpole"), make_task("cartpole"))
+    mpc._solver._solver._run = returning
+    with pytest.raises(KeyboardInterrupt):
+        mpc._solver._solver.run()
