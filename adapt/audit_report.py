@@ -74,7 +74,7 @@ def figures(rows):
     for name in ("fit", "finetune", "gate"):
         found[f"seconds of {name}: median"] = f"{rows[f'seconds_{name}'].median():.1f}"
     found["processor seconds of a case: median"] = f"{rows.cpu_seconds.median():.1f}"
-    return found
+    return {what: text.replace("nan", "–") for what, text in found.items()}
 
 
 def _better(rows, column):
