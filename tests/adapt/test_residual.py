@@ -399,7 +399,7 @@ def test_transitions_that_cannot_teach_are_refused():
         (data.select(slice(0, 9)), "9 transitions, at least 10 are needed"),
         (replace(data, dt=0.05), "control period is 0.05 s, expected 0.1 s"),
         (flights("fixed_wing", "", 30), "recorded on fixed_wing, expected quadrotor"),
-        (replace(data, state=broken), "row 5: state is not finite"),
+        (replace(data, state=broken), "transition 5: state is not finite"),
     ):
         with pytest.raises(InputError, match=message):
             fit_residual(wrong, source)
