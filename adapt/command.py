@@ -67,6 +67,11 @@ def _parse(name, options):
     raise InputError(f"{text} (see python -m {name} --help)")
 
 
+def file_name(text, also=""):
+    """A text as part of a file's name: what isn't a letter, a digit or one of -_.=, and `also` becomes a dash."""
+    return "".join(c if c.isalnum() or c in f"-_.=,{also}" else "-" for c in text)
+
+
 def output_folder(path, overwrite, outputs=()):
     """Make the folder of a run, or refuse one that already holds something.
 

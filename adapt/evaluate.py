@@ -139,9 +139,9 @@ def _target(options, system):
     from envs.registry import make_dynamics
 
     if options.plant:
-        from adapt.plants import Flights, make_plant
+        from adapt.plants import make_flights
 
-        return Domain(), Flights(make_plant(options.plant, system), system, options.plant)
+        return Domain(), make_flights(options.plant, system)
     domain = parse_target(options.target, system)
     return domain, make_dynamics(system, domain)
 

@@ -137,8 +137,7 @@ def _default_folder(options):
     from pathlib import Path
 
     robot = Path(options.vehicle).stem if options.vehicle else options.system
-    text = "-".join((robot, *options.target))
-    text = "".join(c if c.isalnum() or c in "-_.=,@" else "-" for c in text)
+    text = command.file_name("-".join((robot, *options.target)), also="@")
     return f"runs/online-{text}-{options.seconds:g}s-seed{options.seed}"
 
 

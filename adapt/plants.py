@@ -171,6 +171,11 @@ def flights_of(plant, policy, target=None, oracle=False):
     return plant if isinstance(plant, Flights) else Flights(plant, policy.task.system)
 
 
+def make_flights(name, system):
+    """`Flights` of a plant by name, see `make_plant`."""
+    return Flights(make_plant(name, system), system, name)
+
+
 def make_plant(name, system):
     """A plant for a system by name: one of `SIMULATORS`, or "module:factory" of one's own, called with the system.
 

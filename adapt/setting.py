@@ -42,9 +42,9 @@ def pick_setting(options):
 
     system, vehicle = command.pick_robot(options.system, options.vehicle)
     if options.plant:
-        from adapt.plants import Flights, make_plant
+        from adapt.plants import make_flights
 
-        return Setting(system, vehicle, plant=Flights(make_plant(options.plant, system), system, options.plant))
+        return Setting(system, vehicle, plant=make_flights(options.plant, system))
     if recorded_only(options):
         return Setting(system, vehicle)
     domain = parse_target(options.target or DEFAULT_TARGET, system)
@@ -96,12 +96,9 @@ def default_folder(options):
     """Where results go unless `--out` says so."""
     robot = Path(options.vehicle).stem if options.vehicle else options.system
     text = "-".join((robot, *(["pixels"] if options.pixels else []), *target_text(options).split()))
-    text = "".join(c if c.isalnum() or c in "-_.=," else "-" for c in text)
-    if recorded_only(options):
-        flown = ""
-    else:
-        flown = f"-{Path(options.transitions).stem}" if options.transitions else f"-n{options.samples}"
-    return f"runs/fewshot-{text}{flown}-seed{options.seed}"
+    if not recorded_only(options):
+        text += f"-{Path(options.transitions).stem}" if options.transitions else f"-n{options.samples}"
+    return f"runs/fewshot-{command.file_name(text)}-seed{options.seed}"
 
 
 def recorded_only(options):

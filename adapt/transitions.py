@@ -157,13 +157,14 @@ def check(transitions, system=None, minimum=1, source="transitions"):
         _check_system(transitions, system, source)
     for part in ("state", "action", "next_state", "context"):
         values = getattr(transitions, part)
-        if values is not None and not torch.isfinite(values).all():
-            row = int((~torch.isfinite(values)).any(-1).nonzero()[0]) + 1
-            raise InputError(f"{source}: transition {row}: {part} is not finite; remove the row")
-        if values is not None and values.abs().max() > LARGEST:
-            row = int((values.abs() > LARGEST).any(-1).nonzero()[0]) + 1
-            largest = float(values[row - 1].abs().max())
-            raise InputError(f"{source}: transition {row}: {part} is as large as {largest:.3g}; remove the row")
+        if values is None:
+            continue
+        wrong = (~(values.abs() <= LARGEST)).any(-1).nonzero()  # a number that is none is no smaller either
+        if len(wrong):
+            row = int(wrong[0])
+            largest = float(values[row].abs().max())
+            said = f"as large as {largest:.3g}" if math.isfinite(largest) else "not finite"
+            raise InputError(f"{source}: transition {row + 1}: {part} is {said}; remove the row")
     if set(QUATERNION) <= set(transitions.state_names):
         _check_quaternions(transitions, source)
 

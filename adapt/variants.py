@@ -53,7 +53,7 @@ def _step(base, names):
     """The compiled step, or None where that isn't possible."""
     try:
         (step,) = compile_batches([parametric(base, names)], shared=1)
-    except (CompilerError, NotImplementedError):
+    except (CompilerError, TypeError):
         return None
     return step
 
@@ -62,7 +62,7 @@ def parametric(base, names):
     """The step of `base` as a `casadi.Function` (state, action, parameters) -> next_state.
 
     Raises:
-        NotImplementedError: the equations do with a parameter what can't be done with a symbol.
+        TypeError: the equations do with a parameter what can't be done with a symbol.
     """
     import casadi
 
@@ -72,7 +72,7 @@ def parametric(base, names):
     try:
         following = changed(base, symbols, _unchecked).advance(state, action, backend=casadi_backend())
     except Exception as error:  # CasADi has no class of its own for "not a number"
-        raise NotImplementedError(f"{base.system.name}: {error}") from error
+        raise TypeError(f"{base.system.name}: {error}") from error
     return casadi.Function("variant", [state, action, parameters], [following], {"cse": True})
 
 

@@ -400,6 +400,7 @@ def test_transitions_that_cannot_teach_are_refused():
         (replace(data, dt=0.05), "control period is 0.05 s, expected 0.1 s"),
         (flights("fixed_wing", "", 30), "recorded on fixed_wing, expected quadrotor"),
         (replace(data, state=broken), "transition 5: state is not finite"),
+        (replace(data, state=broken.nan_to_num(1e30)), "transition 5: state is as large as 1e"),
     ):
         with pytest.raises(InputError, match=message):
             fit_residual(wrong, source)
